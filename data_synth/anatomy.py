@@ -1,4 +1,4 @@
-"""Sizes and structures of the phantom: what grows with gestational age, and the parts of the brain as shapes.
+"""Anatomy of the phantom: sizes and signals by gestational age, and the structures of the brain as shapes.
 
 Structures are signed distances in mm, positive inside (`data_synth.shapes`). They are symmetric about x = 0
 and are drawn for x >= 0 only.

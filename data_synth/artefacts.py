@@ -1,7 +1,7 @@
 """Artefacts inside single slices, by torchio: motion during a slice's own acquisition, ghosts, k-space spikes.
 
-torchio's `RandomMotion` fills parts of an image's k-space from moved copies of it, which blurs that image and
-makes it ring. It is not the motion from slice to slice, which `data_synth.motion` makes.
+torchio's `RandomMotion` fills parts of an image's k-space from moved copies of the image, which causes blur and
+ringing. Motion between slices is simulated by `data_synth.motion`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,14 @@ from data_synth.augment import applied
 from data_synth.simulator import SimulatedStack
 
 SLICE_WIDTH_MM = 1000.0
-"""Thickness of a slice as torchio sees it: motion through the plane must not carry it out of its one voxel."""
+"""Slice thickness passed to torchio, so large that through-plane motion never leaves the single voxel of the slice."""
 
 
 def slice_artefacts() -> tio.OneOf:
-    """One of the artefacts; images are [1, I, J], with k-space lines along J for motion and along either for ghosts."""
+    """A transform that applies one artefact at random.
+
+    Images are [1, I, J]. K-space lines run along J for motion, and along either axis for ghosts.
+    """
     return tio.OneOf(
         {
             tio.RandomMotion(degrees=4, translation=3, num_transforms=2): 0.5,
@@ -39,7 +42,7 @@ def with_artefacts(stacks: Sequence[SimulatedStack], share: float, rng: np.rando
 
     Args:
         stacks: as simulated.
-        share: probability (0 to 1) that a slice has one.
+        share: probability (0 to 1) that a slice has an artefact.
         rng: source of randomness.
     """
     transform = slice_artefacts()
@@ -54,9 +57,10 @@ def with_artefacts(stacks: Sequence[SimulatedStack], share: float, rng: np.rando
 
 
 def slice_by_slice(transform: tio.Transform) -> Callable[[Tensor], Tensor]:
-    """A transform as a function of a stack [1, I, J, K] whose slices are taken one after another, in pixels.
+    """A function that applies a transform to each slice of a stack [1, I, J, K] separately, with lengths in pixels.
 
-    Each slice draws anew from torch's generator, as a part of a transform that is `applied`.
+    Each slice draws its own random numbers from torch's generator. Use it inside a transform passed to `applied`,
+    which seeds that generator.
 
     Args:
         transform: see `slice_artefacts`.
@@ -68,8 +72,8 @@ def slice_by_slice(transform: tio.Transform) -> Callable[[Tensor], Tensor]:
 
 
 def _as_subject(image: Tensor, spacing_mm: NDArray[np.float64]) -> tio.Subject:
-    """A slice [I, J] as torchio is to see it."""
-    # the last axis counts torchio's k-space lines: it must be one of the plane
+    """A slice [I, J] as a torchio subject [1, 1, I, J]."""
+    # torchio's k-space lines run along the last axis, which must therefore be an in-plane axis
     affine = np.diag([SLICE_WIDTH_MM, spacing_mm[0], spacing_mm[1], 1.0])
     return tio.Subject(image=tio.ScalarImage(tensor=image.contiguous()[None, None], affine=affine))
 

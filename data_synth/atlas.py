@@ -28,7 +28,7 @@ EXTENSIONS = (".nii.gz", ".nii")
 
 @dataclass(frozen=True)
 class AtlasSubject:
-    """Where a subject's files are; `name` is its path relative to the atlas folder, with `/`."""
+    """Paths of a subject's files; `name` is its path relative to the atlas folder, with `/`."""
 
     name: str
     image: Path
@@ -58,19 +58,19 @@ class TruthVolume:
 
 
 def find_subjects(folder: str | Path, include: Sequence[str] = (), exclude: Sequence[str] = ()) -> list[AtlasSubject]:
-    """Volumes with masks below a folder, by name.
+    """Subjects (volumes with masks) below a folder, sorted by name.
 
     Recognised are SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, and X.nii.gz with X_mask.nii.gz or
-    X-mask.nii.gz. SUBJECT/labels.nii.gz, if there is one, holds the tissues.
+    X-mask.nii.gz. SUBJECT/labels.nii.gz, if it exists, holds the tissues.
 
     Args:
         folder: the root of the tree.
-        include: glob patterns of which one must match; none takes all. A pattern is compared with the
+        include: glob patterns, one of which must match; an empty list takes all. A pattern is compared with the
             subject's path relative to the folder and with the last part of that path.
-        exclude: glob patterns of which none may match.
+        exclude: glob patterns, none of which may match.
 
     Raises:
-        InputError: no such folder, or no subject in it that the patterns let through.
+        InputError: no such folder, or no subject in it passes the patterns.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -102,14 +102,14 @@ def find_subjects(folder: str | Path, include: Sequence[str] = (), exclude: Sequ
 
 
 def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume:
-    """Read a subject: canonical axes (RAS, as near as its header allows), one voxel size, normalised, masked.
+    """Read a subject as a normalised, masked volume with isotropic voxels and the axis order closest to RAS.
 
     Args:
         subject: its files.
         spacing_mm: isotropic voxel size; None keeps the file's own grid.
 
     Raises:
-        InputError: unreadable files, a mask of another grid, an empty mask, or an image without contrast.
+        InputError: unreadable files, a mask on another grid, an empty mask, or an image without contrast.
     """
     volume = load_volume(subject.image)
     mask = load_mask(subject.mask, volume)
@@ -193,11 +193,14 @@ def _resampled(
     spacing: NDArray[np.float64],
     spacing_mm: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.uint8] | None, NDArray[np.float64]]:
-    """Cubic splines onto cubic voxels with the same axes, smoothed first where the new voxel is larger."""
+    """Resample to isotropic voxels with the same axes.
+
+    The image is interpolated by cubic splines, after smoothing along axes whose new voxels are larger.
+    """
     step = spacing_mm / spacing  # old voxels per new voxel
     shape = np.maximum(np.floor((np.array(data.shape) - 1) / step).astype(int) + 1, 1)
     start = ((np.array(data.shape) - 1) - (shape - 1) * step) / 2
-    sigma = 0.42 * np.sqrt(np.maximum(step**2 - 1, 0))  # FWHM of a voxel, old and new, in quadrature
+    sigma = 0.42 * np.sqrt(np.maximum(step**2 - 1, 0))  # a FWHM of one voxel, old and new, subtracted in quadrature
     smooth = gaussian_filter(data, sigma) if sigma.any() else data
     new = affine_transform(smooth, step, start, tuple(shape), order=3, mode="nearest")
     inside = affine_transform(mask.astype(np.float32), step, start, tuple(shape), order=1) > 0.5

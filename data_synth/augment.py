@@ -1,4 +1,4 @@
-"""Variation of a truth volume before it is sliced, by torchio's transforms and by our own where it has none."""
+"""Augmentation of a truth volume before it is sliced: torchio's transforms, and our own where torchio has none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONTRAST_SHARE, VENTRICLES_SHARE, LESION_SHARE = 0.3, 0.2, 0.25
 """How often a head gets other tissue intensities, enlarged ventricles, lesions."""
 
 MIN_MASK_SHARE = 0.3
-"""Less than this of the mask left: the head was pushed out of the grid."""
+"""If less than this share of the mask is left, the transform pushed the head out of the grid and is discarded."""
 
 
 def augmentation() -> tio.Compose:
@@ -42,7 +42,7 @@ def augmentation() -> tio.Compose:
 
 
 def augmented(volume: TruthVolume, transform: tio.Transform, rng: np.random.Generator) -> TruthVolume:
-    """The volume with other tissues, at times with a pathology, and transformed.
+    """A randomly augmented volume: sometimes other tissue intensities or a pathology, then a torchio transform.
 
     Args:
         volume: a head, with labels where they are known.
@@ -50,7 +50,8 @@ def augmented(volume: TruthVolume, transform: tio.Transform, rng: np.random.Gene
         rng: source of randomness.
 
     Returns:
-        A volume without labels. It is zero outside its (moved) mask, and its 99.5th percentile is 1.
+        A volume without labels. It is zero outside its (moved) mask, and its 99.5th percentile is 1. If too little of
+        the mask is left (`MIN_MASK_SHARE`), the volume before the torchio transform.
     """
     volume = _other_anatomy(volume, rng)
     moved = transformed(volume, transform, rng)
@@ -86,8 +87,9 @@ def transformed(volume: TruthVolume, transform: tio.Transform, rng: np.random.Ge
 def applied(transform: tio.Transform, subject: tio.Subject, rng: np.random.Generator) -> Any:
     """Apply a torchio transform whose random numbers come from `rng`.
 
-    torchio draws from torch's global generator; it is seeded here and put back afterwards. One thread: torch's powers
-    differ in the last bit where the shares of two threads meet, and numba changes the number of torch's threads.
+    torchio draws from torch's global generator, which is seeded here and restored afterwards. The transform runs on
+    one thread, because torch's powers differ in the last bit where the parts of two threads meet, and numba changes
+    torch's number of threads.
 
     Args:
         transform: to apply.

@@ -1,4 +1,4 @@
-"""Other contrasts of a labelled head: each tissue gets an intensity of its own, its inner structure stays."""
+"""Random contrasts of a labelled head: each tissue gets a new mean intensity and keeps its inner structure."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.ndimage import gaussian_filter
 from data_synth.atlas import TruthVolume
 
 NEAR_SHARE = 0.5
-"""How often intensities stay near the true ones (another field strength, another echo time); otherwise they
+"""Probability that intensities stay near the true ones (as with another field strength or echo time). Otherwise they
 are drawn uniformly for every tissue (Billot et al. 2023, SynthSeg)."""
 
 NEAR_DEVIATION = 0.12
 INTENSITY_RANGE = (0.1, 1.0)
 STRUCTURE_RANGE = (0.4, 1.6)
-"""Factor on what varies inside a tissue."""
+"""Range of the factor on intensity variation inside a tissue."""
 
 PARTIAL_VOLUME_VOXELS = 0.4
 """Smoothing of the labels: a voxel on a border is a mixture of tissues."""
@@ -30,7 +30,7 @@ def recoloured(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
     true image T, m_l its new mean and g_l a factor on its structure.
 
     Args:
-        head: with labels; without any it is returned as it is.
+        head: with labels; a head without labels is returned unchanged.
         rng: source of randomness.
     """
     if head.labels is None:

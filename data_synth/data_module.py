@@ -1,4 +1,4 @@
-"""Common part of the data modules of both networks: the subjects, the checks of settings, the worker processes."""
+"""Base class of the three data modules (prior, pose and mask network): subjects, settings checks, worker processes."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from g3r.errors import InputError
 logger = logging.getLogger(__name__)
 
 VALIDATION_SEED = 1_000_003
-"""Added to the seed for validation."""
+"""Offset that is added to the seed for validation."""
 
 
 class SyntheticDataModule(LightningDataModule):
     """Training data made on the fly from an atlas folder or from the built-in phantom.
 
-    Training items differ from epoch to epoch, validation items never.
+    Training items differ from epoch to epoch; validation items do not.
 
     Args:
         source: `phantom`, or a folder of NIfTI volumes with masks (see `data_synth.atlas`).
-        include: glob patterns of subject names for training; none takes all.
-        exclude: glob patterns of subject names neither to train nor to validate on.
-        val_include: glob patterns of subject names to validate on; they are not trained on. None validates on
-            other simulations of the training subjects, which flatters the network, and says so.
+        include: glob patterns of subject names for training; None takes all.
+        exclude: glob patterns of subject names to use neither for training nor for validation.
+        val_include: glob patterns of subject names for validation; they are excluded from training. None validates
+            on other simulations of the training subjects, which flatters the network, and logs a warning.
         num_workers: worker processes that make training data.
-        seed: decides every item together with its epoch and index.
+        seed: determines every item, together with its epoch and index.
 
     Raises:
         InputError: no such folder, or nothing in it passes the patterns.
@@ -66,7 +66,7 @@ class SyntheticDataModule(LightningDataModule):
                 raise InputError(f"data.{name}: {self.hparams[name]}; expected at least 1")
 
     def setup(self, stage: str | None = None) -> None:
-        """Find the subjects; their volumes are loaded when they are needed."""
+        """Find the subjects; their volumes are loaded on first use."""
         if self.train_set is None:
             self.train_set, self.val_set = self.make_sets()
             n_train, n_val = len(self.train_set.subjects), len(self.val_set.subjects)
@@ -77,7 +77,7 @@ class SyntheticDataModule(LightningDataModule):
         raise NotImplementedError
 
     def subjects(self, n_val_phantoms: int) -> tuple[list[Subject], list[Subject]]:
-        """The subjects to train on and those to validate on; where the source is the phantom, `n_val_phantoms`."""
+        """Training and validation subjects; `n_val_phantoms` validation subjects if the source is the phantom."""
         if self._subjects is None:
             h: Any = self.hparams
             self._subjects = training_and_validation(
@@ -86,21 +86,21 @@ class SyntheticDataModule(LightningDataModule):
         return self._subjects
 
     def train_loader(self, n_items: int, n_batches: int, *, split_ranks: bool = False, **options: Any) -> DataLoader:
-        """A loader of the training set with an `EpochSampler`, whose worker processes stay.
+        """A loader of the training set with an `EpochSampler` and persistent worker processes.
 
         Args:
             n_items: per epoch.
             n_batches: per epoch, over all processes.
-            split_ranks: whether processes that train together have items of their own; Lightning sees to that
-                for the loaders that it is given itself.
-            options: further ones of the loader.
+            split_ranks: whether to divide the items among the processes of a distributed training. Lightning does this
+                itself for loaders that it is given directly.
+            options: further options of the loader.
         """
         self.setup()
         assert self.train_set is not None
         trainer, n_workers = self.trainer, int(self.hparams["num_workers"])
         rank, n_ranks = (trainer.global_rank, trainer.world_size) if trainer is not None and split_ranks else (0, 1)
-        # Workers are spawned, because numba's and torch's thread pools do not survive a fork, and stay, because
-        # they hold the loaded volumes.
+        # Workers are spawned, because the thread pools of numba and torch do not survive a fork. They persist,
+        # because they hold the loaded volumes.
         return DataLoader(
             self.train_set,
             sampler=EpochSampler(
@@ -114,14 +114,14 @@ class SyntheticDataModule(LightningDataModule):
         )
 
     def val_loader(self, collate: Callable[[Any], Any] | None = None) -> DataLoader:
-        """A loader of the validation set, one item at a time; without `collate` an item is a batch already."""
+        """A loader of the validation set, one item per batch; without `collate` an item is already a batch."""
         self.setup()
         assert self.val_set is not None
         return DataLoader(self.val_set, batch_size=1 if collate else None, collate_fn=collate)
 
 
 def one_thread(worker: int) -> None:
-    """Keep a worker process to one core; the training has the others."""
+    """Limit a worker process to one core, so that the others are free for the training."""
     torch.set_num_threads(1)
     numba.set_num_threads(1)
     sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)

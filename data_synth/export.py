@@ -1,4 +1,4 @@
-"""Simulated stacks as a folder of NIfTI files with their true poses, written whole or not at all."""
+"""Export of simulated stacks to a folder of NIfTI files with their true poses, written atomically."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def save_simulation(
     Args:
         folder: output folder.
         truth: the volume that was sliced.
-        stacks: what was made of it.
-        record: settings, to be kept with the data.
-        replace: whether a folder that holds files already may be replaced.
+        stacks: simulated from it.
+        record: settings, written with the data.
+        replace: whether a folder that already holds files may be replaced.
 
     Raises:
         InputError: the folder exists and is not empty (without `replace`), or cannot be written.
@@ -56,9 +56,9 @@ def save_simulation(
 
 
 def check_output(folder: Path, *, replace: bool) -> None:
-    """Refuse an output that is a file, or a folder with content unless it may be replaced.
+    """Refuse an output that is a file, or a non-empty folder that may not be replaced.
 
-    A folder to be replaced must look like an earlier simulation: nothing else is ever deleted.
+    A folder to be replaced must hold an earlier simulation (a `poses.tsv`), so that nothing else is ever deleted.
 
     Raises:
         InputError: see above.

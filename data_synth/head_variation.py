@@ -1,4 +1,4 @@
-"""Heads bent and recoloured at random: more shapes than an atlas has subjects."""
+"""Random elastic deformation and contrast of heads, for more variety than the subjects of an atlas have."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from g3r.geometry import VolumeGrid
 
 CONTROL_SPACING_MM = 24.0
 MAX_BEND_MM = 7.0
-"""Largest displacement of a control point per axis; B-splines leave a third of it between them."""
+"""Largest displacement of a control point per axis; B-splines reduce it to a third between the points."""
 SPLINE_ORDER = 3
 CURVE_KNOTS = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5])
 CURVE_DEVIATION = 0.08
@@ -22,12 +22,12 @@ CURVE_DEVIATION = 0.08
 
 
 def varied_head(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
-    """A head in the atlas frame with another shape and other contrasts, still in the atlas frame."""
+    """A head in the atlas frame with a random shape and contrast; the result is in the atlas frame too."""
     return recurved(bent(head, rng), rng)
 
 
 def bent(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
-    """A head deformed elastically by control points 24 mm apart; the mask's centroid is put at the origin again."""
+    """A head deformed elastically by control points 24 mm apart, with the mask's centroid back at the origin."""
     extent_mm = np.array(head.data.shape) * np.linalg.norm(head.affine[:3, :3], axis=0)
     n_control = np.ceil(extent_mm / CONTROL_SPACING_MM).astype(int) + SPLINE_ORDER
     transform = tio.RandomElasticDeformation(
@@ -40,10 +40,10 @@ def bent(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
 
 
 def recurved(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
-    """A head whose intensities follow a random curve near the identity that keeps zero.
+    """A head whose intensities are mapped by a random curve near the identity that keeps zero.
 
-    The knots are at fixed shares of the head's brightness. MONAI's `RandHistogramShift` spreads them between the
-    extremes of each image, so that single bright voxels would decide.
+    The knots are at fixed fractions of the head's brightness (its 99.5th percentile is 1). MONAI's
+    `RandHistogramShift` spreads its knots between the extremes of each image, so single bright voxels would shift them.
     """
     offset = rng.normal(0, CURVE_DEVIATION, len(CURVE_KNOTS))
     curve = np.maximum(CURVE_KNOTS + offset * (CURVE_KNOTS > 0), 0)

@@ -1,4 +1,4 @@
-"""Heads to learn from: atlas subjects or phantoms, centred, with their gestational age."""
+"""Training heads: atlas subjects or phantoms, centred, with their gestational age."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from g3r.geometry import VolumeGrid
 logger = logging.getLogger(__name__)
 
 N_PHANTOMS = 24
-"""Phantoms made for training; each varies further by augmentation."""
+"""Number of phantoms made for training; augmentation varies each further."""
 
 WEEKS_RANGE = (15.0, 45.0)
-"""Gestational ages that a name may state."""
+"""Range of gestational ages that are accepted from a name."""
 
 WEEKS_IN_NAME = re.compile(
     r"(?<![a-z])(?:sta|sb|ga|weeks?)[-_]?(\d+(?:\.\d+)?)"  # sta27, sb23-notoperated, ga-31.5, week27, weeks-27
     r"|(?<![\d.])(\d+(?:\.\d+)?)[-_]?w(?:eeks?)?(?![a-z])",  # 27w, 27-weeks
     re.IGNORECASE,
 )
-"""An age in a name is marked as one: a bare number is more often that of a subject (`sub-020`, `case31`)."""
+"""Pattern of an age in a name. It requires a marker such as `ga` or `w`, because a bare number is more often a subject
+number (`sub-020`, `case31`)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def phantom_subjects(n: int, seed: int, split: str) -> list[PhantomSubject]:
     Args:
         n: number of phantoms.
         seed: of their shapes.
-        split: `training` or `validation`; they share no phantom.
+        split: `training` or `validation`; the two have no phantom in common.
     """
     first = 10_000 * seed + (5_000 if split == "validation" else 0)
     ages = 21 + 17 * (np.arange(n) + 0.5) / n
@@ -65,15 +66,15 @@ def training_and_validation(
     n_val_phantoms: int,
     seed: int,
 ) -> tuple[list[Subject], list[Subject]]:
-    """Subjects to train on and subjects to validate on.
+    """Training and validation subjects.
 
     Args:
         source: `phantom`, or an atlas folder.
-        include: glob patterns of names for training; none takes all.
-        exclude: glob patterns of names neither to train nor to validate on.
-        val_include: glob patterns of names to validate on, which are not trained on; without any, the
-            training subjects are taken, and a warning says so.
-        n_val_phantoms: phantoms to validate on.
+        include: glob patterns of names for training; None takes all.
+        exclude: glob patterns of names to use neither for training nor for validation.
+        val_include: glob patterns of names for validation, which are excluded from training. Without patterns the
+            training subjects are used for validation too, with a warning.
+        n_val_phantoms: number of validation phantoms.
         seed: of the phantoms.
 
     Raises:
@@ -92,15 +93,15 @@ def training_and_validation(
 
 
 USUAL_WEEKS = 30.0
-"""Age that is taken for heads of no known age, where only a rough one is needed."""
+"""Age assumed for heads of unknown age, where a rough value is enough."""
 
 
 def weeks_of(subject: Subject, otherwise: float | None = None) -> float:
-    """Gestational age in weeks: a phantom's own, or the first that the last part of an atlas name states.
+    """Gestational age in weeks: a phantom's own, or the first age found in the last part of an atlas subject's path.
 
     Args:
         subject: with a name.
-        otherwise: the age of a subject whose name states none.
+        otherwise: age of a subject whose name has none.
 
     Raises:
         InputError: no age as in `sta27`, `sb23-notoperated`, `ga-31.5`, `week27` or `27w`, and no `otherwise`.
@@ -123,7 +124,7 @@ def weeks_of(subject: Subject, otherwise: float | None = None) -> float:
 def load_volume_of(subject: Subject, spacing_mm: float | None) -> TruthVolume:
     """The subject's normalised volume at an isotropic voxel size; for errors see `load_subject`.
 
-    None keeps the grid of an atlas subject; a phantom has none of its own.
+    A `spacing_mm` of None keeps the grid of an atlas subject. A phantom has no grid of its own and needs a value.
     """
     if isinstance(subject, AtlasSubject):
         return load_subject(subject, spacing_mm)

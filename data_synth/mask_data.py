@@ -1,4 +1,4 @@
-"""The LightningDataModule that trains the mask network on scans of scenes made on the fly."""
+"""LightningDataModule of the mask network: scans of random scenes, made on the fly."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ HEAD_SPACING_MM = 1.2
 N_VAL_PHANTOMS = 6
 RECOLOURED_SHARE = 0.3
 SCALE_RANGE = (0.86, 1.08)
-"""Heads are made smaller or larger; atlases begin at 21 weeks."""
+"""Range of the factor on a head's size; it also makes heads smaller than those of atlases, which begin at 21 weeks."""
 NEGATIVE_EVERY = 5
-"""One of so many validation samples shows no head."""
+"""One validation sample in this many shows no head."""
 HARD_LEVEL_SHARE = {"none": 0.15, "mild": 0.3, "moderate": 0.25, "severe": 0.3}
-"""Of the levels of motion, where hard scans are asked for."""
+"""Probability of each level of motion in hard scans."""
 HARD_VIEW_CUT_SHARE = 0.2
 HARD_WRAP_SHARE = 0.15
 HARD_SHELLS = 4
@@ -40,17 +40,17 @@ class MaskDataModule(SyntheticDataModule):
     """Scans of heads in random surroundings from an atlas folder or the built-in phantom; see `mask_batch`.
 
     Args:
-        wide_mm: pixel size at which heads are found.
-        wide_shape: pixels and slices of an image in which they are.
-        pixel_mm: pixel size at which heads are outlined.
+        wide_mm: pixel size of the wide image, in which the head is found.
+        wide_shape: pixels and slices of the wide image.
+        pixel_mm: pixel size of the crop, in which the head is outlined.
         crop_shape: pixels and slices of a crop about a head.
         batch_size: scans per training batch.
         samples_per_epoch: training samples per epoch.
-        scans_per_scene: samples for which one scene serves.
+        scans_per_scene: samples made from one scene.
         val_samples: validation samples.
-        hard_share: of the training scenes with more of what a trained network still takes for a head or misses:
-            more round things in shells, heads at the rim of the field of view or folded over, severe motion. Studies
-            and validation draw scans as they usually are.
+        hard_share: share of training scenes with more of the cases that a trained network still gets wrong: more round
+            objects in dark shells, heads at the rim of the field of view or under folded-over signal, severe motion.
+            Studies and validation draw scans with the usual shares.
         common: see `SyntheticDataModule`.
 
     Raises:
@@ -76,7 +76,7 @@ class MaskDataModule(SyntheticDataModule):
             raise InputError(f"data.hard_share: {hard_share}; expected 0 to 1")
 
     def make_sets(self) -> tuple[MaskSamples, MaskSamples]:
-        """Samples that differ from epoch to epoch, and the same samples each time."""
+        """Training samples, which differ from epoch to epoch, and validation samples, which do not."""
         h: Any = self.hparams
         train, val = self.subjects(N_VAL_PHANTOMS)
         shapes = {
@@ -93,7 +93,7 @@ class MaskDataModule(SyntheticDataModule):
         )
 
     def train_dataloader(self) -> DataLoader:
-        """This epoch's samples."""
+        """A loader of this epoch's samples."""
         h: Any = self.hparams
         n_batches = h.samples_per_epoch // h.batch_size
         return self.train_loader(
@@ -101,19 +101,19 @@ class MaskDataModule(SyntheticDataModule):
         )
 
     def val_dataloader(self) -> DataLoader:
-        """The same samples each time."""
+        """A loader of the validation samples, the same in every epoch."""
         return self.val_loader(mask_batch)
 
 
 class MaskSamples(SubjectDataset[MaskSample]):
-    """Samples made on the fly; an epoch has a few scenes, and the samples go through them in turn.
+    """Samples made on the fly; an epoch has a few scenes, which its samples use in turn.
 
     Args:
         subjects: atlas subjects or phantoms.
         length: samples per epoch.
         seed: of the whole dataset.
         n_scenes: per epoch.
-        in_order: for validation: subjects in turn, heads as they are, and every fifth scan without one.
+        in_order: for validation: subjects in turn, heads without augmentation, and every fifth scan without a head.
         hard_share: see `MaskDataModule`.
         shapes: see `draw_sample`.
     """
@@ -152,7 +152,7 @@ class MaskSamples(SubjectDataset[MaskSample]):
         return filled_head(load_head(subject, HEAD_SPACING_MM))
 
     def _scene(self, epoch: int, number: int) -> Scene:
-        """A scene of this epoch; those of others are forgotten."""
+        """A scene of this epoch; scenes of other epochs are dropped."""
         key = (epoch, number)
         if key not in self._scenes:
             self._scenes = {k: scene for k, scene in self._scenes.items() if k[0] == epoch}
@@ -162,7 +162,7 @@ class MaskSamples(SubjectDataset[MaskSample]):
         return self._scenes[key]
 
     def _is_hard(self, number: int) -> bool:
-        """Whether a scene of an epoch is one of the hard ones, which come first."""
+        """Whether a scene of an epoch is a hard one; the hard scenes have the lowest numbers."""
         return number < round(self.hard_share * self.n_scenes)
 
     def _new_scene(self, which: int, rng: np.random.Generator, further_shells: int = 0) -> Scene:
@@ -173,10 +173,10 @@ class MaskSamples(SubjectDataset[MaskSample]):
 
 
 def new_scene(volume: TruthVolume, rng: np.random.Generator, further_shells: int = 0) -> Scene:
-    """A head of another size in random surroundings.
+    """A randomly scaled head in random surroundings.
 
     Args:
-        volume: of `filled_head`.
+        volume: a result of `filled_head`.
         rng: source of randomness.
         further_shells: see `draw_surroundings`.
     """

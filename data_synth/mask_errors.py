@@ -12,11 +12,11 @@ from data_synth.atlas import TruthVolume
 from data_synth.simulator import SimulatedStack
 
 SKULL_RIM_SHARE = 0.3
-"""How often skull and maternal tissue are seen around the head, and masks reach into them."""
+"""Probability that skull and maternal tissue are visible around the head and masks reach into them."""
 RIM_MM, MISSED_MM = 3.0, 1.5
 SKULL_MM = 1.5
 SMALL_MASK_SHARE = 0.1
-"""How often masks miss the head's outermost voxels."""
+"""Probability that masks miss the head's outermost voxels."""
 
 
 def with_skull_rim(truth: TruthVolume, rng: np.random.Generator) -> TruthVolume:
@@ -31,12 +31,12 @@ def with_skull_rim(truth: TruthVolume, rng: np.random.Generator) -> TruthVolume:
 
 
 def with_mask_errors(stacks: Sequence[SimulatedStack], rng: np.random.Generator, grow: bool) -> list[SimulatedStack]:
-    """Stacks whose masks reach too far or not far enough, by a few pixels in plane.
+    """Stacks whose masks are too large or too small by a few pixels in plane.
 
     Args:
         stacks: as simulated.
         rng: source of randomness.
-        grow: whether masks reach into the rim by up to 3 mm, or miss the head's outermost pixels by up to 1.5 mm.
+        grow: True for masks that reach up to 3 mm into the rim, False for masks that lack up to 1.5 mm of the head.
     """
     result = []
     for one in stacks:

@@ -1,4 +1,4 @@
-"""The head of a scene: an atlas brain in its fluid, skull, scalp, face and neck, as labels on a fine grid."""
+"""Head of a scene: an atlas brain with outer fluid, skull, scalp, face and neck, as labels on a fine grid."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from data_synth.noise import lattice_noise
 from data_synth.shapes import Coordinates, Field, ellipsoid, tube
 
 CLOSING_MM = 9.0
-"""Clefts of the atlas masks narrower than twice this are inside the skull: fissures, the fluid under the brain."""
+"""Clefts of an atlas mask narrower than twice this are filled, since they lie inside the skull: fissures, and the fluid
+under the brain."""
 SMOOTHING_MM = 1.5
-"""Of the skull's inner surface, which is smoother than the mask of an atlas."""
+"""Smoothing of the skull's inner surface, which is smoother than an atlas mask."""
 FLUID_INTENSITY = 0.95
 AROUND_MM = 16.0
-"""Room for skull, scalp and what is next to them."""
+"""Margin of the grid for skull, scalp and adjacent tissue."""
 BELOW_MM = 34.0
-"""Room for the face in front and the neck below."""
+"""Margin of the grid for the face in front and the neck below."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +30,13 @@ class SceneHead:
     """A head ready to be imaged with any contrast.
 
     Args:
-        brain: [I, J, K] float32, intensities of brain and fluid of the atlas; zero elsewhere.
-        inside: [I, J, K] float32 share of brain and outer fluid: the mask to be found.
+        brain: [I, J, K] float32, atlas intensities of brain and fluid; zero elsewhere.
+        inside: [I, J, K] float32 share of brain and outer fluid: the true mask.
         labels: [I, J, K] uint8 of `Tissue`.
         texture: [I, J, K] float32 noise of unit variance.
         affine: [4, 4] atlas frame (mm) from index.
-        base_mm: [3] where the neck begins.
-        radius_mm: of a sphere of the same volume.
+        base_mm: [3] start of the neck.
+        radius_mm: radius of a sphere of the same volume.
     """
 
     brain: NDArray[np.float32]
@@ -48,7 +49,7 @@ class SceneHead:
 
 
 def filled_head(volume: TruthVolume) -> TruthVolume:
-    """A head whose mask is all inside the skull: clefts and holes of the atlas mask hold fluid.
+    """A head whose mask covers everything inside the skull: clefts and holes of the atlas mask are filled with fluid.
 
     Args:
         volume: in the atlas frame, isotropic.
@@ -69,10 +70,10 @@ def filled_head(volume: TruthVolume) -> TruthVolume:
 
 
 def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
-    """A head of `filled_head` (bent and recoloured or not) with random layers about it.
+    """The head of a scene: a filled head with random outer fluid, skull, scalp, face and neck.
 
     Args:
-        volume: in the atlas frame (RAS), isotropic, zero outside its mask.
+        volume: result of `filled_head`, varied or not, in the atlas frame (RAS), isotropic, zero outside its mask.
         rng: source of randomness.
     """
     spacing = float(np.linalg.norm(volume.affine[:3, 0]))
@@ -88,7 +89,7 @@ def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
         for axis, n in enumerate(mask.shape)
     )  # type: ignore[assignment]
     share = gaussian_filter(mask.astype(np.float32), 0.6)
-    # from the surface, which is half a voxel from the last voxel inside
+    # distance from the surface, which is half a voxel from the last voxel inside
     outside_mm = (distance_transform_edt(~mask).astype(np.float32) - 0.5) * np.float32(spacing)
     texture = lattice_noise(mask.shape, float(rng.uniform(1.0, 3.0)), rng)
     radius = float((3 / (4 * np.pi) * mask.sum() * spacing**3) ** (1 / 3))
@@ -97,10 +98,10 @@ def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
     base = low.mean(0) * spacing + affine[:3, 3]
 
     labels = _face_and_neck(points, base, radius, lattice_noise(mask.shape, float(rng.uniform(3, 8)), rng), rng)
-    # extra fluid, skull and scalp; thicker at places
+    # extra fluid, skull and scalp of uneven thickness
     fluid = np.float32(rng.choice([0.0, rng.uniform(0, 2.5)]))
     uneven = np.float32(rng.uniform(0, 0.5)) * lattice_noise(mask.shape, 12.0, rng)
-    thin = rng.uniform(size=2) ** 1.5  # between two bright fluids both may be one dark line
+    thin = rng.uniform(size=2) ** 1.5  # mostly thin: between two bright fluids, skull and scalp may be one dark line
     skull = fluid + np.float32(0.6 + 2.2 * thin[0]) * (1 + uneven)
     scalp = skull + np.float32(0.4 + 4.0 * thin[1]) * (1 + uneven)
     labels[outside_mm <= scalp] = Tissue.SCALP
@@ -124,11 +125,11 @@ def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
 def _face_and_neck(
     points: Coordinates, base: NDArray[np.float64], radius: float, mosaic: Field, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Labels of what is in front of and below the skull; `OUTSIDE` where the surroundings are seen.
+    """Labels of face, jaw, neck and eyes; `OUTSIDE` where the surroundings are visible.
 
     Args:
         points: of the grid (mm).
-        base: [3] where the neck begins (mm).
+        base: [3] start of the neck (mm).
         radius: of the head (mm).
         mosaic: [I, J, K] noise that divides the face into tissues.
         rng: source of randomness.
@@ -143,14 +144,14 @@ def _face_and_neck(
     neck = tube(points, [tuple(base), tuple(end)], [thick, thick])
     labels = np.zeros(np.broadcast_shapes(*(p.shape for p in points)), np.uint8)
     both = (face > 0) | (neck > 0) | (jaw > 0)
-    # some heads have a face of patches, others one of little but muscle
+    # the face is a patchwork of tissues in some heads, and almost all muscle in others
     bone, muscle, fat = np.cumsum([rng.uniform(-1.6, -0.6), rng.uniform(0.4, 2.2), rng.uniform(0.4, 1.4)])
     labels[both] = np.select(
         [mosaic[both] < bone, mosaic[both] < muscle, mosaic[both] < fat],
         [Tissue.BONE, Tissue.FACE_MUSCLE, Tissue.FACE_FAT],
         Tissue.FETAL_FLUID,
     )
-    # muscles about the spine are as round as a head, and the canal in them as bright as a ventricle
+    # neck muscles and spinal canal can be mistaken for a head: round, with a centre as bright as a ventricle
     inner = tube(points, [tuple(base), tuple(end)], [0.8 * thick, 0.8 * thick])
     labels[(inner > 0) & (mosaic > bone)] = Tissue.FACE_MUSCLE
     canal = tube(points, [tuple(base + np.array([0, 0, 10])), tuple(end)], [6.0, 5.0])

@@ -1,4 +1,4 @@
-"""Tissues of the scenes that mask networks learn from, and their random intensities."""
+"""Tissue labels of the scenes that the mask network is trained on, and their random intensities."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Tissue(IntEnum):
-    """Labels of a scene; `OUTSIDE` shows what is behind, in the mother's volume it is air."""
+    """Labels of a scene; `OUTSIDE` is transparent in the head's volume, and air in the volume of the surroundings."""
 
     OUTSIDE = 0
     BRAIN = 1
@@ -65,19 +65,20 @@ _T2: dict[Tissue, tuple[float, float, float]] = {
     Tissue.VESSEL: (0.08, 0.8, 0.2),
     Tissue.DISTRACTOR: (0.55, 0.3, 0.2),
 }
-"""Mean in T2 (the brain's 99.5th percentile is 1), deviation of its logarithm between scans, largest texture."""
+"""Per tissue: mean T2 signal (the brain's 99.5th percentile is 1), standard deviation of its logarithm between scans,
+largest relative standard deviation of its texture."""
 
 ANYTHING_SHARE = 0.2
-"""Scans whose tissues have any intensity."""
+"""Share of scans with uniformly random tissue intensities."""
 DARK_SKULL_SHARE = 0.7
-"""Of those, scans whose skull is dark nevertheless."""
+"""Share of scans with random intensities whose skull keeps its usual dark intensity."""
 MAX_ANY_TEXTURE = 0.4
 
 
 def draw_intensities(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean intensity of each tissue of one scan [T], and the relative deviation of its texture [T].
+    """Mean intensity of each tissue of one scan [T], and the relative standard deviation of its texture [T].
 
-    The brain's entries are 0: its intensities are the atlas's.
+    The brain's entries are 0, because its intensities come from the atlas.
     """
     mean, texture = np.zeros((2, len(Tissue)), np.float32)
     anything = rng.random() < ANYTHING_SHARE

@@ -1,4 +1,4 @@
-"""What a mask network learns from: slices of a scan in large pixels, a crop about its head in small ones, and masks."""
+"""Training samples of the mask network: a wide image of large pixels, a crop of small pixels, and their masks."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 N_OVERSAMPLED = 2
-"""Pixels of the wide image are made of so many along each axis, as a resampled stack is."""
+"""Oversampling per axis: a pixel of the wide image averages this many samples, like a pixel of a resampled stack."""
 JITTER_MM = 6.0
-"""Standard deviation of a crop's centre per axis: as far as a found head may be off."""
+"""Standard deviation of a crop's centre per axis, about the error of a found head position."""
 FAR_JITTER_MM = 25.0
-"""That of some crops: a head is not to be known by being in the middle."""
+"""Standard deviation of the centre of some crops, so that the network cannot rely on the head being in the middle."""
 ELSEWHERE_SHARE = 0.3
-"""Crops about another place, where the network is to see that there is no head, or one at the rim."""
+"""Share of crops about another place, which show no head or a head at the rim."""
 BESIDE_SLICES = 7
-"""A crop's middle slice is at most so many from the head: face and neck are to be known as well as brain."""
+"""Largest distance in slices of a crop's middle slice from the head, so that crops also show face and neck."""
 MAX_NOISE = 0.08
 WIDE_NOISE = 0.05
-"""Largest standard deviations of the noise; a wide pixel is the mean of several."""
+"""Largest standard deviations of the noise in crops and in wide images, whose pixels average several samples."""
 IN_PLANE_BLUR = (0, 0.9, 0, 0.9, 0, 0)
-"""Standard deviations in pixels: from, to, along each axis."""
+"""Range of the blur's standard deviation in pixels: from, to, for each axis."""
 MOTION_SHARE = 0.05
-"""Stacks whose slices were blurred by motion, each by its own, while they were taken."""
+"""Share of stacks with motion during the acquisition of slices, drawn independently for each slice."""
 WRAP_SHARE = 0.08
 
 
@@ -43,9 +43,9 @@ class MaskSample:
     """Images of one scan with the share of brain in each pixel.
 
     Args:
-        wide_image: [A, B, K] some slices in large pixels; K of the scan's own slices.
+        wide_image: [A, B, K] K slices of the scan in large pixels.
         wide_mask: [A, B, K].
-        image: [H, W, K] some slices about the head in small pixels.
+        image: [H, W, K] slices about the head in small pixels.
         mask: [H, W, K].
     """
 
@@ -70,11 +70,11 @@ def draw_sample(
     Args:
         scan: of a scene.
         rng: source of randomness.
-        wide_mm: of the wide image.
-        wide_shape: its pixels and slices; a random part of a larger scan.
-        pixel_mm: of the crop.
+        wide_mm: pixel size of the wide image.
+        wide_shape: pixels and slices of the wide image; a larger scan gives a random part.
+        pixel_mm: pixel size of the crop.
         crop_shape: pixels and slices of the crop.
-        wrap_share: of wide images in which what is beyond the field of view folds into it.
+        wrap_share: share of wide images with signal from outside the field of view folded in.
     """
     wide_image, wide_mask = _wide(scan, rng, wide_mm, wide_shape)
     image, mask = _crop(scan, rng, pixel_mm, crop_shape)
@@ -151,12 +151,12 @@ def _transform() -> tio.Compose:
 def with_artefacts(
     image: Image, rng: np.random.Generator, wrap_share: float = 0.0, max_noise: float = MAX_NOISE
 ) -> Image:
-    """A stack with a bias field, ghosts, motion blur, Rician noise and another gamma, by torchio and MONAI.
+    """A stack with random bias field, ghosts, motion, blur and gamma (torchio), and Rician noise (MONAI).
 
     Args:
-        image: [I, J, K], the brain's brightest about 1.
+        image: [I, J, K], with the brightest brain intensities about 1.
         rng: source of randomness.
-        wrap_share: how often what is beyond the field of view folds into it.
+        wrap_share: probability that signal from outside the field of view is folded in.
         max_noise: largest standard deviation of the noise.
     """
     if wrap_share and rng.random() < wrap_share:
@@ -171,15 +171,15 @@ def with_artefacts(
 
 
 def full_stack(scan: Scan, pixel_mm: float, rng: np.random.Generator) -> tuple[Image, NDArray[np.bool_]]:
-    """A scan as a scanner would write it, with artefacts, and the true mask: pixels of which half is brain.
+    """A scan as a scanner would write it, with artefacts, and the true mask: pixels that are more than half brain.
 
     Args:
         scan: of a scene.
-        pixel_mm: edge of the pixels; those between slices are the scan's own.
+        pixel_mm: edge of the pixels in plane; the slice spacing is the scan's.
         rng: source of randomness.
 
     Returns:
-        Two of [I, J, K].
+        Image and mask, each [I, J, K].
     """
     shape = tuple(int(mm / pixel_mm) for mm in scan.fov_mm)
     first = -(np.array(shape) - 1) / 2 * pixel_mm

@@ -1,4 +1,4 @@
-"""Scans of a scene: contrast, planned slices and motion, and the images of any part of them."""
+"""Scans of a scene: random contrast, slice plan and motion, and images of any part of the scan."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Array = NDArray[np.float64]
 
 LEVEL_SHARE = {"none": 0.2, "mild": 0.4, "moderate": 0.25, "severe": 0.15}
 BLACK_SHARE = 0.05
-"""Scans in which all but the brain is black already."""
+"""Share of scans that are already brain-extracted: black outside brain and outer fluid."""
 NEGATIVE_SHARE = 0.2
-"""Scans without a head."""
+"""Share of scans without a head."""
 PLANNED_SHARE = 0.65
 CUT_SHARE = 0.2
-"""Scans whose slices do not cover the head."""
+"""Share of scans whose slices do not cover the whole head."""
 VIEW_CUT_SHARE = 0.08
-"""Scans whose field of view cuts the head."""
+"""Share of scans whose field of view cuts the head."""
 DROPOUT_SHARE = 0.03
 BREATH_MM = 0.7
-"""Standard deviation of the mother's own movement from slice to slice."""
+"""Standard deviation per axis of the mother's movement, drawn anew for each slice."""
 N_THROUGH = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A head and what is around it, in the head's frame."""
+    """A head and its surroundings, in the head's frame."""
 
     head: SceneHead
     around: Surroundings
@@ -45,13 +45,14 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """A planned and coloured scan of a scene.
+    """A scan of a scene, with its contrast and slice poses.
 
     Args:
+        scene: the scanned scene.
         head: [I, J, K, 3], see `image_slices`.
         behind: [N, N, N] intensities of the surroundings.
-        head_pose: [S] the head's frame from each slice's.
-        scan_pose: [S] the scan's frame from each slice's.
+        head_pose: [S] poses that map the frame of each slice to the head's frame.
+        scan_pose: [S] poses that map the frame of each slice to the scan's frame.
         spacing_mm: between slices.
         thickness_mm: of a slice.
         fov_mm: [2] edges of the field of view, which is centred on the slices' origins.
@@ -79,10 +80,10 @@ class Scan:
         return self._seen_at(self.scene.around.trunk_mm)
 
     def below_head_mm(self, share: float) -> Array:
-        """A place on the way from the head's centre to where the neck begins and beyond, as `trunk_mm` gives it.
+        """A point on the line from the head's centre through the start of the neck, in the frame of `trunk_mm`.
 
         Args:
-            share: of that way; 1 where the neck begins.
+            share: of the distance to the start of the neck; 1 is the start of the neck, more is beyond it.
         """
         return self._seen_at(share * self.scene.head.base_mm)
 
@@ -97,17 +98,17 @@ class Scan:
         slices: slice = slice(None),
         n_through: int = N_THROUGH,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Part of the scan, black beyond the field of view, and the share of each pixel in the mask.
+        """Images of a part of the scan, black beyond the field of view, and the share of each pixel in the mask.
 
         Args:
             first_mm: the first pixel's centre, from the middle of the field of view.
             pixel_mm: edge of the pixels.
             shape: pixels along both axes.
-            slices: which.
+            slices: range of slices.
             n_through: samples through a slice.
 
         Returns:
-            Two of [*shape, S].
+            Images and shares, each [*shape, S].
         """
         head, around = self.scene.head, self.scene.around
         image, inside = image_slices(
@@ -145,13 +146,13 @@ def draw_scan(
     Args:
         scene: to be scanned.
         rng: source of randomness.
-        negative: True for one that shows no head; None draws it.
+        negative: True for a scan that shows no head; None draws it.
         view_cut_share: see `VIEW_CUT_SHARE`.
-        level_share: of the levels of motion, one in all.
+        level_share: probability of each level of motion; they sum to one.
     """
     if negative is None:
         negative = bool(rng.random() < NEGATIVE_SHARE)
-    beside = negative and rng.random() < 0.4  # the head is there but out of view
+    beside = negative and rng.random() < 0.4  # the head exists but is out of view
     head, behind = _coloured(scene, rng, hidden=negative and not beside)
     if rng.random() < PLANNED_SHARE:
         rotation = planned_rotation(int(rng.integers(3)), rng)
@@ -176,7 +177,7 @@ def draw_scan(
         axis = int(rng.integers(2))
         offset[axis] = np.sign(offset[axis]) * (fov[axis] / 2 - radius * rng.uniform(-0.2, 0.8))
     centre = np.append(offset, 0.0)
-    # the slices' origins: the middle of the field of view at each depth; the head's centre is the scan's origin
+    # a slice's origin is the middle of the field of view at its depth; the scan's origin is the head's centre
     at = np.stack([np.full(len(depth), -offset[0]), np.full(len(depth), -offset[1]), depth], axis=1)
     header = RigidPose(np.broadcast_to(rotation, (len(depth), 3, 3)), at @ rotation.T)
     level = LEVELS[str(rng.choice(list(level_share), p=list(level_share.values())))]
@@ -202,7 +203,7 @@ def draw_scan(
 
 
 def _coloured(scene: Scene, rng: np.random.Generator, hidden: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The head's three channels and the surroundings' intensities with random contrasts."""
+    """The three channels of the head (see `image_slices`) and the intensities of the surroundings, randomly drawn."""
     mean, texture = draw_intensities(rng)
     head, around = scene.head, scene.around
     volume = np.zeros((*head.labels.shape, 3), np.float32)

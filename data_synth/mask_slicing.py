@@ -1,4 +1,4 @@
-"""Slices through a head in its surroundings, in compiled loops: two grids, of which only the head's moves."""
+"""Slicing of a head in its surroundings, in compiled loops: two grids, each with its own poses of the slices."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def image_slices(
     thickness_mm: float,
     n_through: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Images of slices, and how much of each pixel is in the mask.
+    """Images of slices, and the share of each pixel in the mask.
 
     Args:
         head: [I, J, K, 3] intensity times opacity, opacity, and share in the mask, on the head's grid.
-        index_from_head: [4, 4] of that grid, from the head's frame (mm).
-        head_pose: [S] the head's frame from each slice's.
+        index_from_head: [4, 4] voxel index of the head's grid from the head's frame (mm).
+        head_pose: [S] poses that map the frame of each slice to the head's frame.
         behind: [N, N, N] intensities of the surroundings.
-        index_from_scan: [4, 4] of that grid, from the scan's frame (mm).
-        scan_pose: [S] the scan's frame from each slice's.
+        index_from_scan: [4, 4] voxel index of the surroundings' grid from the scan's frame (mm).
+        scan_pose: [S] poses that map the frame of each slice to the scan's frame.
         first_mm: position of the first pixel's centre in the slice.
         pixel_mm: edge of the square pixels.
         shape: pixels along both axes.
@@ -42,7 +42,7 @@ def image_slices(
         n_through: samples through the slice.
 
     Returns:
-        Two of [*shape, S].
+        Images and shares, each [*shape, S].
     """
     depth = ((np.arange(n_through) + 0.5) / n_through - 0.5) * thickness_mm
     return _slices(

@@ -1,4 +1,4 @@
-"""What is around a fetal head in a scan of the mother: labels of random bodies on a coarse grid."""
+"""Surroundings of a fetal head: the mother and the fetal body as random labelled shapes on a coarse grid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 SPACING_MM = 2.5
 HALF_MM = 190.0
-"""Half the edge of the cube that is filled."""
+"""Half the edge of the cube that holds the surroundings."""
 INNER = (Tissue.FETAL_BODY, Tissue.LIVER, Tissue.LUNG, Tissue.FETAL_FLUID, Tissue.BONE)
 ORGANS = (Tissue.ORGAN_A, Tissue.ORGAN_B, Tissue.ORGAN_C, Tissue.ORGAN_D, Tissue.FAT, Tissue.MUSCLE)
 
@@ -38,7 +38,7 @@ class Surroundings:
 
 
 class _Canvas:
-    """A cube of labels to paint bodies into."""
+    """A cube of labels to paint shapes into."""
 
     def __init__(self, centre_mm: Array, rng: np.random.Generator) -> None:
         n = int(2 * HALF_MM / SPACING_MM)
@@ -48,13 +48,13 @@ class _Canvas:
         self.noise = lattice_noise(self.labels.shape, 9.0, rng) + 0.5 * lattice_noise(self.labels.shape, 4.0, rng)
 
     def ellipsoid(self, centre: Array, radius: Array, turn: Array, rough: float = 0.0) -> tuple:
-        """Where an ellipsoid is: the part of the canvas, and its implicit value there (1 at the centre, 0 at the rim).
+        """The canvas region of an ellipsoid, and its implicit function there (1 at the centre, 0 at the surface).
 
         Args:
             centre: [3] (mm).
             radius: [3] half axes (mm).
             turn: [3, 3] its axes as columns.
-            rough: how far noise moves its surface, as a share of its size.
+            rough: displacement of its surface by noise, as a share of its size.
         """
         reach = np.sqrt(((turn * radius) ** 2).sum(1)) * (1 + 2 * rough)
         low = np.clip(np.floor((centre - reach - self.first_mm) / SPACING_MM), 0, len(self.labels)).astype(int)
@@ -71,7 +71,7 @@ class _Canvas:
         return part, value + np.float32(rough) * self.noise[part] if rough else value
 
     def put(self, tissue: int, centre: Array, radius: Array, turn: Array, *, rough: float = 0.0, on: int = -1) -> None:
-        """Paint an ellipsoid; with `on` only where that tissue is."""
+        """Paint an ellipsoid; with `on`, only over that tissue."""
         part, value = self.ellipsoid(centre, radius, turn, rough)
         inside = value > 0
         if on >= 0:
@@ -79,7 +79,7 @@ class _Canvas:
         self.labels[part][inside] = tissue
 
     def tube(self, tissue: int, start: Array, end: Array, radius: float, *, core: int = -1) -> None:
-        """Paint a straight tube as one long ellipsoid per piece, with a core of another tissue."""
+        """Paint a straight tube as one long ellipsoid, optionally with a core of another tissue."""
         axis = end - start
         length = float(np.linalg.norm(axis))
         turn = _axes_along(axis / max(length, 1e-6))
@@ -95,10 +95,10 @@ def draw_surroundings(
     """Mother and fetal body about a head at the origin.
 
     Args:
-        base_mm: [3] where the neck begins.
+        base_mm: [3] start of the neck.
         radius_mm: of the head.
         rng: source of randomness.
-        further_shells: round things in a dark shell beyond those that any mother has, at most; as large as heads.
+        further_shells: largest number of additional head-sized round objects in a dark shell.
     """
     r = radius_mm
     bend = Rotation.from_rotvec([rng.uniform(-0.2, 1.0), 0, rng.normal(0, 0.3)]).as_matrix()
@@ -110,14 +110,14 @@ def draw_surroundings(
     mother, uterus = _mother(canvas, middle, down, r, rng)
     for _ in range(int(rng.integers(4, 14))):
         _maternal_body(canvas, middle, mother, rng)
-    if further_shells:  # no number is drawn otherwise: scenes of a seed stay as they were
+    if further_shells:  # no random number is drawn without them, so that the scenes of existing seeds do not change
         for _ in range(int(rng.integers(further_shells + 1))):
             at = mother[0] + mother[2] @ (rng.uniform(-0.8, 0.8, 3) * mother[1])
             radius = radius_mm * rng.uniform(0.5, 1.1) * rng.uniform(0.85, 1.15, 3)
             _shell(canvas, at, radius, Rotation.random(rng=rng).as_matrix(), rng)
     _uterus(canvas, uterus, r, rng)
     canvas.put(Tissue.FETAL_BODY, trunk, size, bend)
-    if rng.random() < 0.7:  # bowel, kidneys and much else: as mixed as a brain
+    if rng.random() < 0.7:  # bowel, kidneys and other organs: as heterogeneous as a brain
         _mix(canvas, trunk, size - rng.uniform(1.5, 5), bend, rng)
     canvas.put(Tissue.LUNG, trunk - down * 0.45 * size[2], size * 0.55, bend, rough=0.1)
     canvas.put(Tissue.LIVER, trunk + down * 0.15 * size[2], size * [0.7, 0.6, 0.35], bend, rough=0.1)
@@ -143,9 +143,9 @@ Ellipsoid = tuple[Array, Array, Array]
 def _mother(
     canvas: _Canvas, middle: Array, down: Array, r: float, rng: np.random.Generator
 ) -> tuple[Ellipsoid, Ellipsoid]:
-    """Skin, fat, muscle and a patchwork of organs; returns the mother and the uterus within her."""
+    """Paint fat, muscle and a patchwork of organs; return the ellipsoids of the mother and of the uterus."""
     turn = _axes_along(down)
-    if rng.random() < 0.6:  # heads lie across, too
+    if rng.random() < 0.6:  # transverse lies occur, too
         turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3)).as_matrix() @ turn
     gap = rng.uniform(2, 14, 3) + rng.choice([0.0, 1.0]) * rng.uniform(0, 45, 3)
     inner = np.array([1.15 * r, 1.15 * r, 2.2 * r]) + gap
@@ -167,7 +167,7 @@ def _mother(
 
 
 def _maternal_body(canvas: _Canvas, middle: Array, mother: Ellipsoid, rng: np.random.Generator) -> None:
-    """A bladder, a loop of bowel, a vessel, vertebrae beside their canal, or a round thing like a head."""
+    """Paint one maternal structure: bladder, organ, vessel, spine with canal, head-like ball or bowel loop."""
     centre, radius, turn = mother
     at = centre + turn @ (rng.uniform(-0.8, 0.8, 3) * radius)
     kind = rng.integers(6)
@@ -192,7 +192,7 @@ def _maternal_body(canvas: _Canvas, middle: Array, mother: Ellipsoid, rng: np.ra
 
 
 def _shell(canvas: _Canvas, at: Array, radius: Array, turn: Array, rng: np.random.Generator) -> None:
-    """A dark shell about something without folds."""
+    """Paint a head-like ball: a dark shell about tissue without folds."""
     shell, fluid = rng.uniform(2, 5), rng.choice([0.0, 4.0])
     canvas.put(int(rng.choice([Tissue.BONE, Tissue.MUSCLE])), at, radius + shell, turn)
     canvas.put(Tissue.MATERNAL_FLUID, at, radius, turn)
@@ -202,7 +202,7 @@ def _shell(canvas: _Canvas, at: Array, radius: Array, turn: Array, rng: np.rando
 
 
 def _mix(canvas: _Canvas, at: Array, radius: Array, turn: Array, rng: np.random.Generator) -> None:
-    """An ellipsoid of patches of a few tissues.
+    """Paint an ellipsoid with patches of a few tissues.
 
     Args:
         canvas: to paint on.
@@ -219,7 +219,7 @@ def _mix(canvas: _Canvas, at: Array, radius: Array, turn: Array, rng: np.random.
 
 
 def _uterus(canvas: _Canvas, uterus: Ellipsoid, r: float, rng: np.random.Generator) -> None:
-    """Wall, placenta on one side, fluid, and at times a head-like ball, a cord, or membranes in it."""
+    """Paint the uterus: wall, fluid, mostly a placenta on one side, at times a head-like ball or thin tubes."""
     centre, inner, turn = uterus
     canvas.put(Tissue.UTERUS, centre, inner + rng.uniform(3, 14), turn, rough=0.02)
     canvas.put(Tissue.AMNIOTIC, centre, inner, turn, rough=0.04)

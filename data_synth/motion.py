@@ -1,7 +1,6 @@
-"""How a fetal head moves during a stack.
+"""Simulated motion of a fetal head during a stack.
 
-All poses are motions of world space: a point x of a slice by the file's header is truly at R x + t.
-Every function takes the generator that it draws from.
+All poses are motions of world space: a point that the file's header puts at x is truly at R x + t.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class MotionLevel:
-    """How much a head moves; angles and lengths are standard deviations per axis.
+    """Amount of motion; angles and lengths are standard deviations per axis.
 
     Args:
         walk_deg: random walk of the rotation vector per slice in time.
@@ -29,7 +28,7 @@ class MotionLevel:
         jerk_mm: translation of a jerk.
         offset_deg: rotation of a whole stack.
         offset_mm: translation of a whole stack.
-        dropout_share: probability that motion during a slice's excitation takes its signal (dropout).
+        dropout_share: probability that a slice loses its signal to motion during its excitation (dropout).
     """
 
     walk_deg: float = 0.0
@@ -64,7 +63,7 @@ LEVELS = {
 def slice_trajectory(
     n_slices: int, level: MotionLevel, center_mm: Array, interleave: int, rng: np.random.Generator
 ) -> RigidPose:
-    """True motion of each slice of one stack: a random walk with jerks in time, about a stack's own offset.
+    """True motion of each slice of one stack: a random walk in time with jerks, about an offset of the whole stack.
 
     Args:
         n_slices: K.
@@ -93,7 +92,7 @@ def slice_trajectory(
 
 
 def place_in_time(n_slices: int, interleave: int) -> NDArray[np.int64]:
-    """When each slice of a stack is acquired: its number in time [K], in the order of the slices in space."""
+    """Acquisition rank of each slice of a stack [K], in the order of the slices in space."""
     place = np.empty(n_slices, np.int64)
     place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
     return place

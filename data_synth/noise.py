@@ -1,4 +1,4 @@
-"""Smooth noise on large grids in milliseconds: drawn on a coarse lattice, linear between its points."""
+"""Fast smooth noise on large grids: drawn on a coarse lattice and interpolated linearly."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from g3r.acquisition.axis_resampling import along_axes, axis_weights
 
 
 def lattice_noise(shape: tuple[int, ...], step: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Noise of about unit variance whose values are independent beyond `step` voxels.
+    """Noise of about unit variance with a correlation length of about `step` voxels.
 
     Args:
         shape: [I, J, K] of the grid.
-        step: distance of the lattice's points in voxels, at least 1.
+        step: spacing of the lattice points in voxels, at least 1.
         rng: source of randomness.
     """
     size = tuple(int(np.ceil(n / step)) + 2 for n in shape)

@@ -1,4 +1,4 @@
-"""An object that is no brain, for what has to work without an atlas: ellipsoids with texture, and nothing symmetric."""
+"""A synthetic object that is not a brain, to test reconstruction without an atlas: asymmetric textured ellipsoids."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BODY_MM = (34.0, 44.0, 30.0)
 LOBE_MM = (20.0, 18.0, 16.0)
 LOBE_OFFSET_MM = (22.0, -26.0, 12.0)
 N_INSIDE = 14
-"""Ellipsoids inside, of other intensities."""
+"""Number of smaller ellipsoids inside, with other intensities."""
 INSIDE_RADIUS_RANGE_MM = (4.0, 12.0)
 WAVELENGTHS_MM = (18.0, 9.0)
 TEXTURE = 0.12
@@ -22,11 +22,11 @@ MARGIN_MM = 4.0
 
 
 def textured_ellipsoids(spacing_mm: float = 0.8, seed: int = 0) -> TruthVolume:
-    """A body with a lobe at its side, full of smaller ellipsoids and waves.
+    """A body with a lobe at its side, filled with smaller ellipsoids and waves.
 
     Args:
         spacing_mm: isotropic voxel size.
-        seed: sizes, places and intensities of what is inside.
+        seed: of the sizes, positions and intensities of the inner structures.
     """
     rng = np.random.default_rng([seed, 0])
     half = np.maximum(BODY_MM, np.abs(LOBE_OFFSET_MM) + LOBE_MM) + MARGIN_MM
@@ -46,7 +46,7 @@ def textured_ellipsoids(spacing_mm: float = 0.8, seed: int = 0) -> TruthVolume:
 
 
 def _filled(p: Coordinates, shape: tuple[int, ...], spacing_mm: float, rng: np.random.Generator) -> Field:
-    """Intensities inside the object, as if it had no surface."""
+    """Intensities of the object's interior, on the whole grid."""
     value: NDArray[np.float32] = np.full(shape, 0.5, np.float32)
     for _ in range(N_INSIDE):
         direction = rng.normal(size=3)

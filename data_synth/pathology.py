@@ -1,4 +1,4 @@
-"""Heads that no atlas of healthy subjects holds: enlarged ventricles, and lesions of any intensity."""
+"""Simulated pathology that atlases of healthy subjects lack: enlarged ventricles, and lesions of any intensity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from g3r.geometry import VolumeGrid
 Array = NDArray[np.float64]
 
 REACH_MM = 4.0
-"""How far from the wall of a ventricle tissue gives way."""
+"""Distance from the wall of a ventricle within which tissue is displaced."""
 
 LESION_RADIUS_MM = (1.5, 6.0)
 LESION_EDGE_MM = 0.4
@@ -23,11 +23,11 @@ MAX_LESIONS = 3
 
 
 def enlarged_ventricles(head: TruthVolume, translation_mm: float) -> TruthVolume:
-    """A head whose ventricles have grown into the brain around them.
+    """A head with enlarged ventricles that displace the brain around them.
 
     Args:
-        head: with ventricles; without any it is returned as it is.
-        translation_mm: how far the walls move at most; up to `REACH_MM` no tissue is folded.
+        head: with ventricles; a head without is returned unchanged.
+        translation_mm: largest movement of the walls; up to `REACH_MM` no tissue is folded.
 
     Raises:
         ValueError: a translation below 0 or beyond `REACH_MM`.
@@ -40,7 +40,7 @@ def enlarged_ventricles(head: TruthVolume, translation_mm: float) -> TruthVolume
     smooth = gaussian_filter(head.ventricles.astype(np.float32), REACH_MM / spacing_mm, truncate=3.0)
     inwards = np.stack(np.gradient(smooth, *spacing_mm))  # 1/mm, along the grid's axes
     steepest = float(np.sqrt((inwards**2).sum(0)).max())
-    # a voxel shows what lay further inwards
+    # each voxel takes its value from a point further inwards
     index = np.indices(head.data.shape, dtype=np.float32)
     index += inwards * np.float32(translation_mm / steepest) / spacing_mm[:, None, None, None].astype(np.float32)
     data = map_coordinates(head.data, index, order=3, mode="nearest", output=np.float32)
@@ -53,7 +53,7 @@ def enlarged_ventricles(head: TruthVolume, translation_mm: float) -> TruthVolume
 
 
 def with_lesions(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
-    """A head with one to three ellipsoids of another intensity, anywhere in the mask."""
+    """A head with one to three random ellipsoidal lesions centred anywhere in the mask."""
     inside = np.argwhere(head.mask)
     for _ in range(int(rng.integers(1, MAX_LESIONS + 1))):
         center = inside[rng.integers(len(inside))]
@@ -66,14 +66,14 @@ def with_lesions(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
 def with_lesion(
     head: TruthVolume, center: NDArray[np.integer], radii_mm: Array, intensity: float, axes: Array | None = None
 ) -> TruthVolume:
-    """A head in which one ellipsoid has one intensity.
+    """A head with one ellipsoidal lesion of uniform intensity.
 
     Args:
         head: intensities of order one.
         center: [3] voxel.
         radii_mm: [3] half axes.
-        intensity: inside.
-        axes: [3, 3] axes of the ellipsoid as columns; those of the world when None.
+        intensity: of the lesion.
+        axes: [3, 3] axes of the ellipsoid as columns; None takes the axes of the world.
     """
     grid = VolumeGrid(head.data.shape, head.affine)
     box = _box(head, center, float(np.max(radii_mm)) + 4 * LESION_EDGE_MM)

@@ -1,12 +1,12 @@
-"""A procedural fetal brain: T2 contrast and labels as functions of gestational age, with no data needed.
+"""A procedural fetal brain phantom: T2 contrast and labels as functions of gestational age, without any data.
 
 The brain is put together from implicit shapes in a RAS frame centred in the head. What changes with age:
 size (biparietal and occipitofrontal diameters of normal fetuses), opening of the Sylvian fissure, number and
 depth of sulci, width of the subarachnoid space and of the ventricles, cerebellar width, and contrast.
 
-Sulci are thin radial sheets: the zero set of band-limited noise on the direction seen from a hemisphere's
-centre, followed inwards from the surface to a depth that grows with age. The cortical plate is the 2 mm
-layer under the folded surface, so it lines both banks of every sulcus, as the real one does.
+Sulci are thin radial sheets: the zero set of band-limited noise on the directions from a hemisphere's
+centre, from the surface inwards to a depth that grows with age. The cortical plate is the 2 mm
+layer under the folded surface, so it lines both banks of every sulcus, as in a real brain.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LABELS = {
     "deep_grey": 6,
     "brainstem": 7,
 }
-"""The labels of the FeTA challenge (Payette et al. 2021), so that its tools read the phantom."""
+"""The labels of the FeTA challenge (Payette et al. 2021), so that its tools can read the phantom."""
 
 AGE_RANGE_WEEKS = (18.0, 41.0)
 
@@ -53,7 +53,7 @@ class Phantom:
     Args:
         t2: [I, J, K] T2-weighted signal, 0 to about 1000.
         labels: [I, J, K] tissues (`LABELS`).
-        mask: [I, J, K] the head, with its fluid.
+        mask: [I, J, K] the head, including its fluid.
         affine: [4, 4] RAS+ mm from index.
     """
 
@@ -72,7 +72,7 @@ def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float =
         seed: individual shape, folds and texture; the same seed gives the same voxels.
 
     Returns:
-        The phantom on a RAS grid centred at the world's origin.
+        The phantom on a RAS grid centred at the origin of the world.
 
     Raises:
         InputError: age or voxel size out of range.
@@ -98,7 +98,7 @@ def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float =
         for n, o, s in zip(shape, affine[:3, 3], middle, strict=True)
     ]
     grid = np.meshgrid(*axes, indexing="ij", sparse=True)
-    bend = 0.015 * body.a  # individual shape: the coordinates are warped a little before anything is drawn
+    bend = 0.015 * body.a  # individual shape: the coordinates are warped slightly before drawing
     x, y, z = (axis + np.float32(bend) * smooth_noise(shape, 0.45 * body.a, spacing_mm, rng) for axis in grid)
     t2, labels, mask = _draw(body, (x, y, z), spacing_mm, rng)
     return Phantom(t2, labels, mask, affine)
@@ -107,7 +107,7 @@ def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float =
 def _draw(
     body: Anatomy, p: Coordinates, spacing_mm: float, rng: np.random.Generator
 ) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
-    """Lay the tissues over each other, from CSF inwards, each weighted with its share of the voxel."""
+    """Draw the tissues over each other, from CSF inwards, each weighted by its share of the voxel."""
     x, y, z = p
     half = (np.abs(x), y, z)  # mirror-symmetric shapes are drawn for one side
     a, b = body.a, body.b
@@ -200,7 +200,7 @@ def _folded_surface(
     # Sulci: radial sheets on the direction from the hemisphere's centre (sphere of radius a, in mm).
     centre = (np.float32(0.36 * a), np.float32(0), np.float32(0.0))
     sign = np.where(x < 0, np.float32(-1), np.float32(1))
-    # Noise on the position curves the sulci in section, where straight radial cuts would look artificial.
+    # Noise on the position curves the sulci; straight radial cuts would look artificial in cross-section.
     wobble = [np.float32(0.035 * a) * smooth_noise(x.shape, 0.14 * a, spacing_mm, rng) for _ in range(3)]
     u = (
         (side - centre[0] + wobble[0]) * 1.25,

@@ -1,4 +1,4 @@
-"""The LightningDataModule that trains the pose network on slice sets synthesised on the fly."""
+"""LightningDataModule of the pose network: slice sets synthesised on the fly."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from data_synth.trajectories import RecordedTrajectory, load_trajectories
 from g3r.acquisition.atlas_template import AtlasTemplate
 
 HEAD_SPACING_MM = 2.0
-"""Voxel size of the truth that is sliced; pixels are larger."""
+"""Voxel size of the truth volume, smaller than the pixels of the slices."""
 VAL_MAX_SLICES = 120
 MAX_VALIDATION_STACKS = 6
 N_VAL_PHANTOMS = 8
 N_VARIANTS = 8
-"""Shapes and contrasts per subject and epoch; making one takes as long as several slice sets."""
+"""Variants (shape and contrast) per subject and epoch; making one takes as long as making several slice sets."""
 MIN_SHARE = 4
-"""A training set has at least this fraction (one over it) of the largest number of slices."""
+"""The limit on slices is drawn for each training set from max_slices / MIN_SHARE to max_slices."""
 
 
 class SliceSetDataModule(SyntheticDataModule):
@@ -37,13 +37,13 @@ class SliceSetDataModule(SyntheticDataModule):
     See `slice_set_batch` for a batch.
 
     Args:
-        trajectories: npz file of recorded motion; None takes a model with the statistics of one.
+        trajectories: npz file of recorded motion; None takes a model with the same statistics.
         pixel_mm: edge of the pixels.
         image_size: pixels per edge of a slice image.
-        max_slices: of a training set; for each set a number from a quarter of it on is drawn.
+        max_slices: upper limit of slices in a training set; each set draws its own limit, at least a quarter of this.
         batch_size: heads per training batch.
         sets_per_epoch: training sets per epoch.
-        val_sets: validation sets; their numbers of stacks go through 1 to 6 in turn.
+        val_sets: validation sets; they have 1 to 6 stacks in turn.
         common: see `SyntheticDataModule`.
 
     Raises:
@@ -66,7 +66,7 @@ class SliceSetDataModule(SyntheticDataModule):
         self._template: AtlasTemplate | None = None
 
     def make_sets(self) -> tuple[SliceSets, SliceSets]:
-        """Sets that differ from epoch to epoch, and the same sets each time."""
+        """Training sets, which differ from epoch to epoch, and validation sets, which do not."""
         h: Any = self.hparams
         train, val = self.subjects(N_VAL_PHANTOMS)
         recorded = load_trajectories(h.trajectories) if h.trajectories else []
@@ -76,13 +76,13 @@ class SliceSetDataModule(SyntheticDataModule):
         )
 
     def template(self) -> AtlasTemplate:
-        """Mean heads of the training subjects."""
+        """Atlas template of the training subjects."""
         if self._template is None:
             self._template = atlas_templates(self.subjects(N_VAL_PHANTOMS)[0])
         return self._template
 
     def train_dataloader(self) -> DataLoader:
-        """This epoch's sets."""
+        """A loader of this epoch's sets."""
         h: Any = self.hparams
         n_batches = h.sets_per_epoch // h.batch_size
         return self.train_loader(
@@ -90,7 +90,7 @@ class SliceSetDataModule(SyntheticDataModule):
         )
 
     def val_dataloader(self) -> DataLoader:
-        """The same sets each time, one head at a time."""
+        """A loader of the validation sets, one head per batch, the same in every epoch."""
         return self.val_loader(slice_set_batch)
 
 
@@ -105,7 +105,7 @@ class SliceSets(SubjectDataset[SliceSet]):
         pixel_mm: see `draw_slice_set`.
         size: see `draw_slice_set`.
         recorded: see `draw_slice_set`.
-        in_order: for validation: subjects and numbers of stacks in turn, heads as they are.
+        in_order: for validation: subjects and numbers of stacks in turn, heads without variation.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class SliceSets(SubjectDataset[SliceSet]):
         """Set (epoch, index)."""
         which, rng = self.draw(epoch, index)
         max_slices = self.max_slices
-        if not self.in_order:  # many heads of few slices teach more per second than few heads of many
+        if not self.in_order:  # many heads with few slices train faster than few heads with many slices
             max_slices = int(rng.integers(max(self.max_slices // MIN_SHARE, 1), self.max_slices + 1))
         return draw_slice_set(
             self._head(which, epoch, -1 if self.in_order else int(rng.integers(N_VARIANTS))),
@@ -146,7 +146,7 @@ class SliceSets(SubjectDataset[SliceSet]):
         return load_head(subject, HEAD_SPACING_MM)
 
     def _head(self, which: int, epoch: int, variant: int) -> Head:
-        """A subject as it is (variant -1) or one of its variants of this epoch."""
+        """A subject's head, unchanged (variant -1) or one of its variants of this epoch."""
         key = (which, epoch if variant >= 0 else 0, variant)
         if key not in self._heads:
             volume = self.volume(which)
@@ -161,7 +161,7 @@ def slice_set_batch(sets: Sequence[SliceSet]) -> dict[str, torch.Tensor]:
     """The slices of several heads as one dict of tensors, with their true poses.
 
     Keys: `image` [S, 1, N, N], `area_mm2`, `position_mm`, `thickness_mm`, `time_rank` [S], `stack` [S]
-    numbered through all heads, `set_of_stack` [G], `header_rotation` and `true_rotation` [S, 3, 3],
+    (numbered consecutively over all heads), `set_of_stack` [G], `header_rotation` and `true_rotation` [S, 3, 3],
     `true_translation_mm` [S, 3].
     """
     batch: dict[str, np.ndarray] = {

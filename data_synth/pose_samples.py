@@ -1,4 +1,4 @@
-"""Sets of slice images with their true poses in the atlas frame, made in milliseconds."""
+"""Training samples of the pose network: slice images with true poses in the atlas frame, each made in milliseconds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_NOISE = 0.06
 """Largest standard deviation of the noise; the head's 99.5th percentile is 1."""
 MIN_AREA_MM2 = 60.0
 LOOK_PIXEL_MM, LOOK_SIZE = 5.0, 36
-"""Large pixels by which the head is found in the field of view."""
+"""Pixel size and image size of the coarse masks that locate the head in the field of view."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class SliceSet:
     """Slice images of one head with their true poses.
 
     Args:
-        images: what the network sees.
-        true_pose: [K] atlas frame from the image's frame.
+        images: input of the network.
+        true_pose: [K] poses that map the frame of each image to the atlas frame.
     """
 
     images: SliceImages
@@ -48,17 +48,17 @@ def draw_slice_set(
     recorded: Sequence[RecordedTrajectory] = (),
     vary: bool = True,
 ) -> SliceSet:
-    """One set from a head: stacks planned, moved, sliced; shape and intensities varied.
+    """A random slice set of a head: stacks are planned, moved and sliced; shape and intensities are varied.
 
     Args:
         head: the truth.
         rng: source of randomness.
         pixel_mm: edge of the square pixels.
         size: pixels per edge.
-        max_slices: of all stacks together; above it slices are dropped at random.
+        max_slices: of all stacks together; a larger set is thinned, and the excess dropped at random.
         n_stacks: None draws 1 to 6.
         recorded: trajectories to follow instead of the model's.
-        vary: False leaves shape and intensities as they are (noise, gain and dropout too).
+        vary: False keeps shape and intensities, without noise, gain or dropout.
     """
     shape = _random_shape(rng) if vary else np.eye(3)
     index_from_atlas = np.linalg.inv(head.affine) @ _homogeneous(np.linalg.inv(shape))
@@ -67,7 +67,7 @@ def draw_slice_set(
     plan = draw_stacks(corners, rng, n_stacks, recorded)
     threshold = float(rng.uniform(0.3, 0.6)) if vary else 0.5
 
-    # where each stack's mask is by its header, at large pixels
+    # coarse masks of the moved slices, which the header poses then place
     look = sample_masks(head, index_from_atlas, plan.true_pose, LOOK_PIXEL_MM, LOOK_SIZE, threshold)
     area = look.sum((1, 2)) * LOOK_PIXEL_MM**2
     kept = _thinned(np.flatnonzero(area > MIN_AREA_MM2), max_slices, rng)
@@ -95,7 +95,7 @@ def draw_slice_set(
 
 
 def _thinned(kept: NDArray[np.int64], max_slices: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """At most `max_slices` slices: every other one, or every third, and a few more dropped at random."""
+    """At most `max_slices` slices: every n-th one, less a few that are dropped at random."""
     if len(kept) > max_slices:
         stride = len(kept) // max_slices
         kept = kept[int(rng.integers(stride)) :: stride]
@@ -105,7 +105,7 @@ def _thinned(kept: NDArray[np.int64], max_slices: int, rng: np.random.Generator)
 
 
 def _shift_to_centroid(look: NDArray[np.float32], area: Array, header: RigidPose, stack_id: NDArray[np.int64]) -> Array:
-    """From each slice's centre to its stack's centroid by the header, in the slice's own axes [K, 3] (mm)."""
+    """Vectors [K, 3] (mm, slice axes) from slice centres to the centroid of the stack's mask, by the headers."""
     at = (np.arange(LOOK_SIZE) - (LOOK_SIZE - 1) / 2) * LOOK_PIXEL_MM
     weight = np.maximum(look.sum((1, 2)), 1e-6)
     middle = np.stack([look.sum(2) @ at / weight, look.sum(1) @ at / weight, np.zeros(len(look))], axis=1)
@@ -116,7 +116,7 @@ def _shift_to_centroid(look: NDArray[np.float32], area: Array, header: RigidPose
 
 
 def _random_shape(rng: np.random.Generator) -> Array:
-    """A linear map near the identity: size 10 %, each axis 4 %, sometimes mirrored left to right."""
+    """A random linear map near the identity: size varied by 10 %, each axis by 4 %; half are mirrored left-right."""
     stretch = np.exp(rng.uniform(-0.1, 0.1) + rng.normal(0, 0.04, 3).clip(-0.08, 0.08))
     stretch[0] *= rng.choice([-1.0, 1.0])
     return np.diag(stretch)
@@ -133,13 +133,13 @@ def _random_intensities(
 ) -> NDArray[np.float32]:
     """Gamma, a gain for each slice, a bias field, dropout and Rician noise.
 
-    The bias field is one slope in the atlas frame that all slices of a head share, whatever their poses;
-    torchio's `RandomBiasField` would give each image a field of its own.
+    The logarithm of the bias field is one linear slope in the atlas frame, common to all slices of a head.
+    torchio's `RandomBiasField` would give each image its own field.
 
     Args:
         image: [K, N, N] slices, 0 to about 1.
         inside: [K, N, N] the mask's share of each pixel.
-        pose: [K] atlas frame from the slices.
+        pose: [K] poses that map the frame of each slice to the atlas frame.
         pixel_mm: edge of the square pixels.
         rng: source of randomness.
     """
@@ -159,8 +159,8 @@ def log_bias(slope_per_mm: Array, pose: RigidPose, pixel_mm: float, size: int) -
     """Logarithm [K, N, N] of a bias field that rises along one direction of the atlas frame.
 
     Args:
-        slope_per_mm: [3] of the logarithm, along the atlas's axes; it is 0 at their origin.
-        pose: [K] atlas frame from the slices.
+        slope_per_mm: [3] of the logarithm, along the axes of the atlas frame; the logarithm is 0 at the origin.
+        pose: [K] poses that map the frame of each slice to the atlas frame.
         pixel_mm: edge of the square pixels.
         size: N, pixels per edge.
     """

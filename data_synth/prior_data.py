@@ -1,4 +1,4 @@
-"""The LightningDataModule that trains the prior network on stacks synthesised on the fly."""
+"""LightningDataModule of the prior network: stacks synthesised on the fly."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.errors import InputError
 
 MIXED_SUBJECTS = 4
-"""Subjects whose patches are shuffled together."""
+"""Number of subjects whose patches are shuffled together."""
 
 
 class StackSynthesisDataModule(SyntheticDataModule):
@@ -37,11 +37,11 @@ class StackSynthesisDataModule(SyntheticDataModule):
         batch_size: patches per training batch.
         subjects_per_epoch: synthetic subjects per epoch.
         val_subjects: validation volumes.
-        val_crop: edge in voxels of the central cube that is validated on.
-        artefact_share: probability that a slice is corrupted within its own acquisition: motion while its k-space
+        val_crop: edge in voxels of the central cube used for validation.
+        artefact_share: probability that a slice has an artefact from its own acquisition: motion while its k-space
             is filled, ghosts or a spike (`data_synth.artefacts`); 0 for none.
-        distinct_epochs: after this many epochs the same subjects come again, in other patches; 0 for never.
-        cache: folder that keeps synthetic subjects once made (about 15 MB each); None keeps none.
+        distinct_epochs: number of epochs after which the same subjects are repeated, with other patches; 0 for never.
+        cache: folder that stores synthetic subjects (about 15 MB each); None stores none.
         template_spacing_mm: voxel size of the atlas template.
         common: see `SyntheticDataModule`.
 
@@ -82,7 +82,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
         self._template: AtlasTemplate | None = None
 
     def template(self) -> AtlasTemplate:
-        """The atlas template of the training subjects, which the network carries."""
+        """The atlas template of the training subjects, which is stored with the network."""
         if self._template is None:
             self._template = atlas_templates(
                 self.subjects(self.hparams["val_subjects"])[0],
@@ -92,7 +92,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
         return self._template
 
     def make_sets(self) -> tuple[SyntheticSubjects, SyntheticSubjects]:
-        """Patches of subjects that differ from epoch to epoch, and central cubes of the same few each time."""
+        """Training patches, from new subjects in each epoch, and central cubes of fixed validation subjects."""
         h: Any = self.hparams
         train, val = self.subjects(h.val_subjects)
         template = self.template()
@@ -120,10 +120,10 @@ class StackSynthesisDataModule(SyntheticDataModule):
         )
 
     def train_dataloader(self) -> PatchBatches:
-        """Shuffled patches of this epoch's subjects."""
+        """Batches of shuffled patches of this epoch's subjects."""
         h: Any = self.hparams
         n_batches = h.patches_per_subject * h.subjects_per_epoch // h.batch_size
-        # the subjects to be mixed next should be ready when they are needed
+        # the next subjects to be mixed should be ready when they are needed
         prefetch = MIXED_SUBJECTS if h.num_workers else None
         subjects = self.train_loader(
             h.subjects_per_epoch, n_batches, split_ranks=True, batch_size=None, prefetch_factor=prefetch
@@ -131,20 +131,20 @@ class StackSynthesisDataModule(SyntheticDataModule):
         return PatchBatches(subjects, h.seed, h.patches_per_subject, h.batch_size)
 
     def val_dataloader(self) -> DataLoader:
-        """The same few volumes each time, made once."""
+        """A loader of the validation volumes, made once and the same in every epoch."""
         return self.val_loader()
 
 
 class PatchBatches(IterableDataset[Patches]):
-    """Batches of patches, those of a few subjects shuffled together.
+    """Batches of patches, shuffled among a few subjects at a time.
 
-    An epoch begins without patches of the last one, and its order follows from the seed and the epoch, so that it
-    is the same whether or not the epochs before it ran in this process.
+    No patches are carried over from one epoch to the next, and the order depends on seed and epoch only. An epoch is
+    therefore the same whether or not the earlier epochs ran in this process.
 
     Args:
-        subjects: loader of all patches of one subject at a time, with an `EpochSampler`.
+        subjects: loader that yields all patches of one subject at a time, with an `EpochSampler`.
         seed: of the order.
-        n_patches: of each subject.
+        n_patches: per subject.
         batch_size: patches per batch; the remainder of an epoch is dropped.
     """
 

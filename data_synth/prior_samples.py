@@ -1,4 +1,4 @@
-"""Training subjects of the prior network: a head, sliced, mis-registered, scattered back to V_coarse and M_rho."""
+"""Training samples of the prior network: a head is sliced with pose errors and spread back to V_coarse and M_rho."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ Patches = dict[str, Tensor]
 """`IMAGE_KEYS` float32 [P, 1, I, J, K], `n_stacks` int64 [P] and `thickness_mm` float32 [P]."""
 
 MARGIN_VOXELS = 6
-"""Background kept around a head: the network must learn that nothing is there."""
+"""Background kept around a head, so that the network learns that the background is empty."""
 MAX_VALIDATION_STACKS = 3
-"""Validation volumes are of 1, 2, 3 stacks in turn."""
+"""Validation volumes are made from 1, 2, 3 stacks in turn."""
 UNKNOWN_MOTION_SHARE = 0.6
-"""How often nothing is known of how the slices of a single stack moved against each other."""
+"""Probability that the motion between the slices of a single stack is unknown, so that they share one mean motion."""
 NOTICED_SHARE = 0.7
-"""How often a slice without signal has been given a low weight."""
+"""Probability that a slice without signal has a low weight."""
 DISTRUSTED_SHARE = 0.15
-"""How often registration gave a run of up to `DISTRUSTED_SLICES` slices of a subject no weight."""
+"""Probability that registration gave weight zero to a run of up to `DISTRUSTED_SLICES` slices of a subject."""
 DISTRUSTED_SLICES = 4
 
 OTHER_AGE_WEEKS = (HALF_WINDOW_WEEKS + 0.5, HALF_WINDOW_WEEKS + 3.5)
-"""Templates are drawn among those whose age differs by so much: a nearer one is a mean of heads with the subject itself
-among them, and no subject in use will find a template as alike."""
+"""Range of the age difference between a training subject and its template. A nearer template is a mean of heads with the
+subject itself among them; subjects in use never have so similar a template."""
 START_DEG, START_MM, START_SCALE = 2.0, 1.5, 0.03
-"""Standard deviations of the place of the template before it is fitted, per axis, and of the log of its size. A head
-that augmentation has turned (`augment.py`) is off by that turn as well."""
+"""Standard deviations of the template's rotation and translation per axis before it is fitted, and of its log size. The
+rotation of a head by augmentation (`augment.py`) comes on top."""
 
 
 class SyntheticSubjects(SubjectDataset[Patches]):
@@ -68,11 +68,11 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         patch_size: edge of a patch; grids are padded to at least this many voxels per axis.
         n_patches: patches of each subject, centred on random voxels of the mask.
         artefact_share: see `with_artefacts`.
-        in_order: for validation: subjects and numbers of stacks in turn, heads as they are, and one patch of each,
-            from the middle of the grid.
-        distinct: after this many epochs the same subjects come again, cut into other patches; 0 for never.
-        cache: folder that keeps subjects once made; None keeps none.
-        template: to fit to the seen part of each head.
+        in_order: for validation: subjects and numbers of stacks in turn, heads without augmentation, and one patch
+            of each from the middle of the grid.
+        distinct: number of epochs after which the same subjects are repeated, cut into other patches; 0 for never.
+        cache: folder that stores synthetic subjects; None stores none.
+        template: atlas template that is fitted to the seen part of each head.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         self.artefact_share = artefact_share
         self.distinct = distinct
         self.augmentation = None if in_order else augmentation()
-        # all that decides the subjects, apart from the code
+        # everything that determines the subjects, except the code
         made_of = (template.weeks.tolist(), template.volume.shape, float(template.volume.mean()))
         spec = ([one.name for one in subjects], made_of, spacing_mm, seed, patch_size, artefact_share, in_order)
         self.cache = SubjectCache(cache, repr(spec)) if cache is not None else None
@@ -116,7 +116,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         return {**patches, **{name: torch.full((len(boxes),), value) for name, value in facts.items()}}
 
     def sample(self, epoch: int, index: int) -> SyntheticSubject:
-        """Subject (epoch, index), whole."""
+        """The whole volumes of subject (epoch, index)."""
         if self.distinct:
             epoch %= self.distinct
         found = None if self.cache is None else self.cache.load(epoch, index)
@@ -141,7 +141,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         return synthesise(truth, head, rng, n_stacks, self.artefact_share)
 
     def _template_head(self, weeks: float, rng: np.random.Generator) -> TemplateHead:
-        """The template to fit: of the subject's age to validate, of another one to train."""
+        """The template to fit: nearest in age for validation, and of another age for training if there is one."""
         apart = np.abs(self.template.weeks - weeks)
         nearest, furthest = OTHER_AGE_WEEKS
         others = np.flatnonzero((apart >= nearest) & (apart <= furthest))
@@ -150,13 +150,13 @@ class SyntheticSubjects(SubjectDataset[Patches]):
 
 
 def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int]) -> list[NDArray[np.int64]]:
-    """First voxels of patches centred on random voxels of a mask and moved back onto the grid.
+    """First voxels of patches that are centred on random voxels of a mask and shifted to lie within the grid.
 
     Args:
         mask: [I, J, K], at least `size` voxels along each axis.
         size: edge of a patch in voxels.
         n: number of patches.
-        seed: decides them.
+        seed: of the random voxels.
     """
     rng = np.random.default_rng(seed)
     center = np.stack(np.unravel_index(rng.choice(np.flatnonzero(mask), n), mask.shape), axis=-1)
@@ -169,7 +169,7 @@ class TemplateHead:
 
     Args:
         volume: [I, J, K] float32, zero outside the brain.
-        grid: about the origin.
+        grid: of the volume, centred at the origin.
     """
 
     volume: NDArray[np.float32]
@@ -183,17 +183,19 @@ def synthesise(
     n_stacks: int | None = None,
     artefact_share: float = 0.0,
 ) -> SyntheticSubject:
-    """One training subject from a truth volume: stacks with random settings, pose errors, G3R Eq. 6.
+    """Synthesise one training subject from a truth volume: stacks with random settings, pose errors, coarse volume.
+
+    V_coarse is that of Eq. 6.
 
     Args:
         truth: the head.
-        template: fitted to what the slices saw.
+        template: to be fitted to the seen part of the head.
         rng: source of randomness.
-        n_stacks: drawn when None.
+        n_stacks: number of stacks; None draws it.
         artefact_share: see `with_artefacts`.
 
     Raises:
-        InputError: no head moved into view in any draw (volumes with an all but empty mask).
+        InputError: a stack shows nothing of the head (as for a volume with an almost empty mask).
     """
     residual = draw_residual_kind(rng)
     settings = draw_settings(residual, rng, n_stacks)
@@ -235,7 +237,7 @@ def synthesise(
 
 
 def _placed(template: TemplateHead, truth: TruthVolume, rng: np.random.Generator) -> VolumeGrid:
-    """The template's grid at the head, about as registration places it."""
+    """The template's grid, placed at the head with about the error of a registration."""
     head_grid = VolumeGrid(truth.data.shape, truth.affine)
     here, there = head_grid.world(np.argwhere(truth.mask)), template.grid.world(np.argwhere(template.volume > 0))
     size_mm, template_size_mm = ((points - points.mean(0)).std() for points in (here, there))
@@ -256,10 +258,10 @@ def _registered_poses(
     residual: ResidualKind,
     rng: np.random.Generator,
 ) -> RigidPose:
-    """Poses that the prior is given: true ones with errors, or for single stacks often one motion for all."""
+    """Poses for the coarse volume: true poses with registration errors; a single stack often has one common motion."""
     true_pose = _per_slice(stacks, slices.stack_id, slices.slice_index)
     motion = true_pose
-    no_jerks = settings[0].motion.n_jerks == 0  # registration finds those
+    no_jerks = settings[0].motion.n_jerks == 0  # jerks are found by registration even in a single stack
     if len(stacks) == 1 and no_jerks and residual != "gross" and rng.random() < UNKNOWN_MOTION_SHARE:
         motion = mean_motion(true_pose, center_mm)
     exact = motion @ slices.planes.pose
@@ -267,7 +269,7 @@ def _registered_poses(
 
 
 def _slice_weights(stacks: Sequence[SimulatedStack], slices: Slices, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Weight [K] of each slice: registration mostly notices slices without signal, and at times distrusts others."""
+    """Weight [K] of each slice: low for most slices without signal; in some subjects zero for a run of slices."""
     dropout = np.array([stacks[s].dropout[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
     noticed = dropout & (rng.random(len(dropout)) < NOTICED_SHARE)
     weight = np.where(noticed, rng.uniform(0, 0.3, len(dropout)), 1.0)
@@ -288,7 +290,7 @@ def _per_slice(
 
 
 def _padded(volume: TruthVolume, smallest: int) -> TruthVolume:
-    """The volume with zeros on both sides of each axis shorter than `smallest` voxels."""
+    """The volume, zero-padded on both sides of each axis that is shorter than `smallest` voxels."""
     missing = np.maximum(smallest - np.array(volume.data.shape), 0)
     if not missing.any():
         return volume

@@ -1,4 +1,4 @@
-"""Settings of a training subject's stacks, drawn as protocols have them."""
+"""Random acquisition settings of a training subject's stacks, distributed as in clinical protocols."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ DROPOUT_SHARE_IF_GROSS = 0.03
 
 
 def draw_settings(residual: ResidualKind, rng: np.random.Generator, n_stacks: int | None = None) -> list[StackSettings]:
-    """Settings of one to six stacks as a protocol may have them: one resolution, mostly orthogonal.
+    """Settings of one to six stacks as in one protocol: common resolution, mostly orthogonal orientations.
 
     Args:
-        residual: dropout comes with gross pose errors.
+        residual: kind of pose errors; dropouts occur only with `gross` ones.
         rng: source of randomness.
-        n_stacks: drawn when None.
+        n_stacks: number of stacks; None draws it.
     """
     drawn = int(rng.choice(list(N_STACKS_SHARE), p=list(N_STACKS_SHARE.values())))
     number = drawn if n_stacks is None else n_stacks
@@ -49,7 +49,7 @@ def draw_settings(residual: ResidualKind, rng: np.random.Generator, n_stacks: in
 
 
 def _draw_gap_mm(thickness_mm: float, rng: np.random.Generator) -> float:
-    """Slices mostly touch; otherwise there are gaps, some as wide as the slices, or slices overlap by up to a half."""
+    """Draw the gap: mostly zero, otherwise positive up to the thickness, or an overlap of up to half the thickness."""
     kind = rng.random()
     if kind < 0.5:
         return 0.0

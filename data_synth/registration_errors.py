@@ -1,4 +1,4 @@
-"""Errors that registration leaves in the poses of slices."""
+"""Simulated registration errors: residual errors in the poses of slices."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from g3r.geometry import RigidPose
 Array = NDArray[np.float64]
 ResidualKind = Literal["none", "small", "gross"]
 TAIL_SHARE, TAIL_FACTOR = 0.1, 3.0
-"""Slices of few pixels and slices that fit badly are the tail of every registration."""
+"""Share of slices with larger errors, and their factor: registration is always worse for slices with few pixels and
+for slices that fit badly."""
 RESIDUAL_SHARE: dict[ResidualKind, float] = {"none": 0.2, "small": 0.65, "gross": 0.15}
-"""How often a subject has which error: exact poses, good registration, registration with failures."""
+"""Probability of each kind for a subject: exact poses, good registration, registration with failures."""
 SMOOTHING_GAIN = float(np.sqrt(2 * np.sqrt(np.pi) * 2.0))
-"""Restores white noise's variance after a Gaussian filter of sigma 2 (sum w^2 = 1 / (2 sqrt(pi) sigma))."""
+"""Factor that restores the variance of white noise after a Gaussian filter of sigma 2
+(sum w^2 = 1 / (2 sqrt(pi) sigma))."""
 
 
 def draw_residual_kind(rng: np.random.Generator) -> ResidualKind:
-    """One kind of residual pose error by its share."""
+    """Draw a kind of residual pose error with the probabilities of `RESIDUAL_SHARE`."""
     kinds: list[ResidualKind] = list(RESIDUAL_SHARE)
     return kinds[int(rng.choice(len(kinds), p=list(RESIDUAL_SHARE.values())))]
 
@@ -31,18 +33,18 @@ def draw_residual_kind(rng: np.random.Generator) -> ResidualKind:
 def residual_errors(
     kind: ResidualKind, stack_id: NDArray[np.int64], center_mm: Array, rng: np.random.Generator
 ) -> RigidPose:
-    """Pose errors of the size that registration leaves behind, each about its slice's own centre.
+    """Pose errors [S] of the size that registration leaves, each a rotation about the slice's own centre and a shift.
 
-    `small`: a subject draws a root mean square length of 0.1-0.8 mm and 0.2-1.2 degrees (medians of 0.2-0.4
-    mm and 90th percentiles of 0.4-1.3 mm were measured before the joint fit, docs/motion.md); half the
-    variance is independent, half shared with neighbouring slices, and one slice in ten is off by three times
-    as much. `gross`: in addition one to three groups of one to six neighbouring slices that are off together by
-    3-8 mm and up to 10 degrees.
+    `small`: a subject draws a root mean square error of 0.1-0.8 mm and 0.2-1.2 degrees (medians of 0.2-0.4
+    mm and 90th percentiles of 0.4-1.3 mm were measured before the joint fit, docs/motion.md). Half the
+    variance is independent, half is shared with neighbouring slices. One slice in ten has three times the error.
+    `gross`: in addition, one to three groups of one to six neighbouring slices have a common error of 3-8 mm and up
+    to 10 degrees.
 
     Args:
         kind: of error.
         stack_id: [S] stack of each slice; slices of a stack are neighbours in this order.
-        center_mm: [S, 3] centres of the slices (where they are taken to be).
+        center_mm: [S, 3] centres of the slices, about which the errors rotate.
         rng: source of randomness.
     """
     n = len(stack_id)
@@ -63,7 +65,7 @@ def residual_errors(
 
 
 def _partly_shared(stack_id: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Unit-variance noise [S, 3]: half its variance varies slowly from slice to slice of a stack."""
+    """Unit-variance noise [S, 3]: half of the variance is smooth along each stack, half is independent per slice."""
     own = rng.normal(size=(len(stack_id), 3))
     shared = rng.normal(size=(len(stack_id), 3))
     for stack in np.unique(stack_id):
@@ -78,7 +80,7 @@ def _direction(rng: np.random.Generator) -> Array:
 
 
 def mean_motion(true_pose: RigidPose, center_mm: NDArray[np.float64]) -> RigidPose:
-    """The one motion [K] that a stack's slices have on average: what is known of a single stack.
+    """Mean motion of a stack's slices, repeated [K]: all that is known of the motion of a single stack.
 
     Args:
         true_pose: [K] motions.

@@ -1,8 +1,8 @@
-"""Implicit shapes: signed distances in millimetres, positive inside, from which the phantom is put together.
+"""Implicit shapes that make up the phantom: signed distances in millimetres, positive inside.
 
-Every function takes the three coordinates as separate arrays (they broadcast) and returns an array of the
-broadcast shape. The distances are exact near a surface and only ordered far from it, which is all that
-partial-volume weights (`coverage`) and layers a few millimetres thick need.
+Coordinates are three separate arrays that broadcast; results have the broadcast shape. The distances are exact near a
+surface. Far from it only their order is right, which is enough for partial-volume weights (`coverage`) and for layers
+a few millimetres thick.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def ellipsoid(p: Coordinates, center_mm: tuple[float, ...], radius_mm: tuple[flo
     q = [(axis - np.float32(c)) / np.float32(r) for axis, c, r in zip(p, center_mm, radius_mm, strict=True)]
     k0 = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
     k1 = np.sqrt(sum((axis / np.float32(r)) ** 2 for axis, r in zip(q, radius_mm, strict=True)))
-    depth = k0 / np.maximum(k1, np.float32(1e-6))  # 0 / 0 at the centre, where the smallest radius is meant
+    depth = k0 / np.maximum(k1, np.float32(1e-6))  # 0 / 0 at the centre, where the smallest radius is used instead
     return (1 - k0) * np.where(k0 < 1e-6, np.float32(min(radius_mm)), depth)
 
 
@@ -58,7 +58,7 @@ def union(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
     Args:
         a: signed distance (mm).
         b: signed distance (mm).
-        blend_mm: width over which the edges where they meet are filled.
+        blend_mm: width over which the concave edges between the shapes are filled.
     """
     if blend_mm <= 0:
         return np.maximum(a, b)
@@ -72,7 +72,7 @@ def intersection(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
     Args:
         a: signed distance (mm), positive inside.
         b: signed distance (mm), positive inside.
-        blend_mm: width over which the edges where they meet are rounded.
+        blend_mm: width over which the convex edges between the shapes are rounded.
     """
     return -union(-a, -b, blend_mm)
 
@@ -83,7 +83,7 @@ def sheet_distance(field: Field, spacing_mm: float, floor_per_mm: float) -> Fiel
     Args:
         field: smooth scalar field on a voxel grid.
         spacing_mm: voxel size.
-        floor_per_mm: lower bound of the gradient (1/mm), so that saddle points make no wide openings.
+        floor_per_mm: lower bound of the gradient (1/mm), so that saddle points cause no wide openings.
     """
     slope = sum(np.gradient(field, np.float32(spacing_mm), axis=axis) ** 2 for axis in range(3))
     return np.abs(field) / np.sqrt(slope + np.float32(floor_per_mm) ** 2)
@@ -118,8 +118,8 @@ def wave_field(p: Coordinates, wavelength_mm: float, bandwidth: float, n_waves: 
 def smooth_noise(shape: tuple[int, ...], sigma_mm: float, spacing_mm: float, rng: np.random.Generator) -> Field:
     """Gaussian noise of unit variance with a correlation length of about `sigma_mm`, on a voxel grid.
 
-    Drawn on a grid about as coarse as the noise is smooth and interpolated by cubic splines, so a
-    long correlation costs no more than a short one.
+    The noise is drawn on a coarse grid with the correlation length as its spacing and interpolated by cubic splines.
+    A long correlation therefore costs no more than a short one.
 
     Args:
         shape: of the grid.

@@ -1,9 +1,9 @@
-"""From a volume to stacks of slices of a moving head, with the true pose of every slice.
+"""Simulation of stacks of a moving head from a volume, with the true pose of every slice.
 
 A pixel is a weighted sum of samples of the volume, spread over the slice's profile (`data_synth.slice_profile`).
-The same simulator makes the stacks of evaluations and of trainings. Bias field and Rician noise are its own
-lines instead of torchio's and MONAI's: the field is fixed to the scanner over a whole stack and stated per
-millimetre, and evaluations must not change with a version of those libraries.
+Evaluation and training use the same simulator. It implements bias field and Rician noise itself instead of using
+torchio and MONAI: the field is fixed to the scanner over a whole stack and defined per millimetre, and evaluations
+must not change with the versions of those libraries.
 """
 
 from __future__ import annotations
@@ -35,35 +35,37 @@ FRAMES = {
 }
 
 FIELD_OF_VIEW_MARGIN_MM = 5.0
-"""Around the head at rest; motion may carry a part of it out of view, as it does in a scanner."""
+"""Margin of the field of view around the head at rest. Motion may move a part of the head out of view, as in a
+scanner."""
 
 SIMULATOR_VERSION = 2
-"""Of the slices that are kept in files; to be raised when the same settings give other slices. Since 2 a pixel of the
+"""Version of stored slices, to be raised when the same settings give other slices. Since version 2 a pixel of the
 `box` and `sinc` profiles averages over its own area in plane."""
 
 SIGNAL_REACH_MM = 3.2
-"""Pixels further than this from the mask, along the axes of its grid and to the nearest voxel, show nothing but noise
-and are not computed."""
+"""Distance from the mask, rounded to voxels and measured along the axes of its grid, beyond which pixels are not
+computed and show only noise. Thick slices reach further (`reach_voxels`)."""
 
 PROFILE_REACH = 0.6
-"""Where the edge of the `box` profile ends, in thicknesses from the centre of the slice: thick slices reach further."""
+"""Outer end of the edge of the `box` profile, in thicknesses from the centre of the slice."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StackSettings:
-    """How one stack is taken.
+    """Acquisition settings of one stack.
 
     Args:
         orientation: of the slices in the head's frame.
         resolution_mm: in-plane pixel spacing.
         thickness_mm: slice thickness.
-        gap_mm: distance between neighbouring slices; negative where they overlap.
-        motion: how much the head moves.
+        gap_mm: gap between the facing edges of neighbouring slices (slice spacing minus thickness), at least
+            -0.9 thickness_mm; negative for overlapping slices.
+        motion: amount of motion.
         interleave: 1 sequential, 2 every other slice first, 3 every third.
-        oblique_deg: standard deviation per axis of a tilt of the slices, known to the header.
+        oblique_deg: standard deviation per axis of a tilt of the slices, which the header states.
         profile: through the slice, `box` with soft edges (what scanners aim for), `gaussian` (the model's) or `sinc`
             (of a short pulse).
-        snr: the 99.5th percentile in the mask is 2 snr noise deviations; infinity for none.
+        snr: half the 99.5th percentile in the mask over the standard deviation of the noise; infinity for no noise.
         bias: strength of the smooth in-plane inhomogeneity; 0 for none.
         gain_deviation: standard deviation of the slices' log gains.
     """
@@ -96,12 +98,12 @@ class StackSettings:
 
 @dataclass(frozen=True)
 class SimulatedStack:
-    """A stack and its truth.
+    """A simulated stack and its true motion and gains.
 
     Args:
-        stack: what a scanner would give; its header states the geometry without motion.
-        true_pose: [K] a point x of slice k by the header is truly at R x + t.
-        gain: [K] intensity factor of each slice (dropouts included).
+        stack: as from a scanner; its header states the geometry without motion.
+        true_pose: [K] a point of slice k that the header puts at x is truly at R x + t.
+        gain: [K] intensity factor of each slice, including dropouts.
         dropout: [K] whether the slice lost its signal.
     """
 
@@ -112,7 +114,7 @@ class SimulatedStack:
 
 
 def orthogonal_settings(n_stacks: int, motion: str = "none", **common: object) -> list[StackSettings]:
-    """Settings of stacks that are axial, coronal, sagittal, axial, ... and share the rest."""
+    """Settings of axial, coronal, sagittal, axial, ... stacks with all other settings in common."""
     if motion not in LEVELS:
         raise InputError(f"motion '{motion}'; expected one of {', '.join(LEVELS)}")
     names: tuple[Orientation, ...] = ("axial", "coronal", "sagittal")
@@ -131,23 +133,23 @@ def simulate_stacks(
     *,
     fine: bool = False,
 ) -> list[SimulatedStack]:
-    """Take stacks of a volume.
+    """Simulate stacks of a volume.
 
     Args:
-        volume: [I, J, K] intensities; anything further than `reach_voxels` from the mask is not seen.
+        volume: [I, J, K] intensities; anything further than `reach_voxels` from the mask is ignored.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
         settings: one entry per stack.
         rng: source of randomness; each stack draws from a child of its own.
-        fine: first put the volume on a grid of half the voxel size by cubic splines. Seconds slower; keeps
+        fine: first resample the volume to half the voxel size by cubic splines. This takes seconds longer and keeps
             the finest detail of a volume that is hardly finer than the stacks.
 
     Raises:
-        InputError: an empty mask, or a stack that would see nothing of the head.
+        InputError: an empty mask, or a stack that shows nothing of the head.
     """
     if not mask.any():
         raise InputError("simulation: the mask is empty; expected the head to be marked")
-    # a head for each reach: what a stack sees does not depend on how thick the slices of others are
+    # one head per reach, so that a stack does not depend on the thickness of the other stacks
     reaches = [reach_voxels(affine, one.thickness_mm) for one in settings]
     heads = {n: _Head.within(volume, mask, affine, n, fine) for n in set(reaches)}
     return [
@@ -157,20 +159,20 @@ def simulate_stacks(
 
 
 def reach_voxels(affine: NDArray[np.float64], thickness_mm: float) -> int:
-    """How far beyond the mask slices may show signal, in voxels along the axes of the grid.
+    """Distance beyond the mask up to which slices show signal, in voxels along the axes of the grid.
 
     Args:
-        affine: [4, 4] of the grid; the smallest edge of its voxels counts.
+        affine: [4, 4] of the grid; the smallest voxel edge is used.
         thickness_mm: of the slices.
     """
     voxel_mm = float(np.linalg.norm(affine[:3, :3], axis=0).min())
-    of_profile = int(np.ceil(PROFILE_REACH * thickness_mm / voxel_mm - 1e-6))  # less what an affine's rounding adds
+    of_profile = int(np.ceil(PROFILE_REACH * thickness_mm / voxel_mm - 1e-6))  # tolerance for rounding of the affine
     return max(round(SIGNAL_REACH_MM / voxel_mm), of_profile, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Head:
-    """The volume to be sliced, its mask, where signal may be, and corners of the mask in the world."""
+    """The volume to be sliced, its mask, the region with signal, and surface points of the mask in the world."""
 
     volume: NDArray[np.float32]
     volume_grid: VolumeGrid
@@ -185,7 +187,7 @@ class _Head:
     def within(
         cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], n_reach: int, fine: bool
     ) -> _Head:
-        """The head cut from its volume, with `n_reach` voxels around it where signal may be."""
+        """The head cropped from its volume, with signal up to `n_reach` voxels around it."""
         inside = np.argwhere(mask)
         low = np.maximum(inside.min(0) - n_reach - 1, 0)
         high = np.minimum(inside.max(0) + n_reach + 2, mask.shape)
@@ -253,7 +255,7 @@ def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generat
         deviation = head.bright / (2 * settings.snr)
         noise = rng.standard_normal((2, *image.shape), dtype=np.float32) * np.float32(deviation)
         image = np.hypot(image + noise[0], noise[1])
-    in_file = (1, 2, 0)  # planes come first here, the file has slices last
+    in_file = (1, 2, 0)  # planes are the first axis here, slices the last axis in the file
     mask3d = mask.reshape(n_slices, *shape[:2]).transpose(in_file)
     if not mask3d.any():
         raise InputError(f"simulation: {name} sees nothing of the head; use less motion or another seed")
@@ -265,7 +267,7 @@ def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generat
 
 
 def _frame(settings: StackSettings, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Axes of the slices by the header: columns in-plane x, y and normal."""
+    """Axes of the slices by the header: columns are in-plane x, in-plane y and normal."""
     if settings.orientation == "random":
         return Rotation.random(rng=rng).as_matrix()
     tilt = Rotation.from_rotvec(np.deg2rad(rng.normal(0, 1, 3) * settings.oblique_deg)).as_matrix()

@@ -1,10 +1,11 @@
-"""The slice profile of the simulator: how pixels average over the volume, in plane and through the slice.
+"""Slice profiles of the simulator: how pixels average over the volume, in plane and through the slice.
 
-Of the three profiles only `gaussian` is the model's. With the two others a pixel averages over its own area in plane:
-k-space that was filled up to the pixel's resolution passes it all, where the model's Gaussian halves what is fine.
+Only the `gaussian` profile is that of the reconstruction model. With `box` and `sinc` a pixel averages over its own
+area in plane: k-space that is filled up to the pixel's resolution passes all detail, whereas the model's Gaussian
+halves the finest detail.
 
-The volume is read by trilinear interpolation, which itself blurs. The sample positions are drawn together by
-just that much, so that the profile seen by the slices has the stated variance.
+The volume is read by trilinear interpolation, which itself blurs. The sample positions are contracted to compensate,
+so that the effective profile has the stated variance.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ Array = NDArray[np.float64]
 Profile = Literal["box", "gaussian", "sinc"]
 
 SINC_LOBES = 2
-"""Zero crossings on either side of the truncated sinc of the `sinc` profile's pulse."""
+"""Zero crossings on either side of the truncated sinc pulse of the `sinc` profile."""
 
 SINC_REACH = 1.5
-"""Where the ripples of the `sinc` profile are cut off, in thicknesses from the centre of the slice."""
+"""Distance at which the ripples of the `sinc` profile are cut off, in thicknesses from the centre of the slice."""
 
 TRILINEAR_VARIANCE = 1.0 / 6.0
-"""Variance that trilinear reading adds on average, in squared voxels: the mean of f (1 - f) over a voxel."""
+"""Mean variance that trilinear interpolation adds, in squared voxels: the mean of f (1 - f) over a voxel."""
 
 
 class ProfileOperator(VoxelOperator):
-    """The voxel operator with a slice profile of the simulator's own.
+    """The voxel operator with a slice profile of the simulator instead of the model's PSF.
 
     Args:
         planes: slices at their true poses.
@@ -61,18 +62,18 @@ class ProfileOperator(VoxelOperator):
 
 
 def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, voxel_mm: float) -> tuple[Array, Array]:
-    """Quadrature of a slice profile whose samples are read by trilinear interpolation.
+    """Quadrature nodes and weights of a slice profile for a volume that is read by trilinear interpolation.
 
     Args:
         resolution_mm: in-plane pixel spacing.
         thickness_mm: slice thickness.
         profile: `gaussian` has the variance of the model's PSF; `box` is flat with soft edges; `sinc` is that of a
-            truncated sinc pulse, steep with ripples. In plane the two latter are a box of one pixel.
+            truncated sinc pulse, steep with ripples. In plane `box` and `sinc` have the variance of a box of one pixel.
         voxel_mm: voxel size of the volume that is read.
 
     Returns:
         Sample positions [Q, 3] (mm in the slice's frame) and weights [Q]. The variance along each axis is that
-        of the profile less that of trilinear interpolation.
+        of the profile minus that of trilinear interpolation.
     """
     blur_mm2 = TRILINEAR_VARIANCE * voxel_mm**2
     target = psf_variance_mm2([resolution_mm] * 2, thickness_mm)
@@ -81,7 +82,7 @@ def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, v
     axes = []
     for axis in range(3):
         reach = 5.2 * np.sqrt(target[axis])
-        # in plane the pixel is about a voxel wide, so that three positions are enough
+        # in plane a pixel is about one voxel wide, so three positions are enough
         n = 3 if axis < 2 else 2 * int(np.ceil(reach / max(0.6, voxel_mm) / 2)) + 1
         if axis == 2 and profile == "box":
             nodes, weights, variance = _soft_box(n, thickness_mm)
@@ -96,7 +97,7 @@ def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, v
 
 
 def profile_deviation(profile: Profile) -> float:
-    """Standard deviation of a profile through the slice, over the thickness."""
+    """Standard deviation of a profile through the slice, in units of the thickness."""
     if profile == "gaussian":
         return float(np.sqrt(psf_variance_mm2([1.0, 1.0], 1.0)[2]))
     shape = _soft_box if profile == "box" else _truncated_sinc
@@ -104,7 +105,7 @@ def profile_deviation(profile: Profile) -> float:
 
 
 def _soft_box(n: int, thickness_mm: float) -> tuple[Array, Array, float]:
-    """A profile flat inside the slice whose edges fall over a fifth of its thickness.
+    """A profile that is flat inside the slice, with edges that fall over a fifth of the thickness.
 
     Returns:
         n nodes scaled to unit variance, their weights, and the profile's true variance in mm^2 (that of a box

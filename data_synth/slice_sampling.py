@@ -1,4 +1,4 @@
-"""Slices of a truth volume by the hundred: averages over pixel and thickness, in compiled loops."""
+"""Fast sampling of many slices of a truth volume, averaged over pixel and thickness, in compiled loops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from g3r.geometry import RigidPose
 Array = NDArray[np.float64]
 
 THROUGH_PLANE = np.array([-1 / 3, 0.0, 1 / 3])
-"""Sample positions through the slice in units of its thickness: a box in thirds."""
+"""Sample positions through the slice in units of its thickness: the centres of the thirds of a box."""
 IN_PLANE = np.array([-0.25, 0.25])
 """Sub-samples of a pixel per axis."""
 MASK_BLUR_VOXELS = 1.0
@@ -27,7 +27,7 @@ class Head:
 
     Args:
         data: [I, J, K] float32.
-        soft_mask: [I, J, K] float32 mask, blurred so that a threshold makes it wider or narrower.
+        soft_mask: [I, J, K] float32 mask, blurred so that the choice of threshold makes it wider or narrower.
         affine: [4, 4] atlas frame from index.
     """
 
@@ -56,7 +56,7 @@ def sample_slices(
     Args:
         head: the truth.
         index_from_atlas: [4, 4] voxel index from the atlas frame (mm).
-        pose: [K] atlas frame from the slices, whose origins are the images' centres.
+        pose: [K] poses that map the frame of each slice (origin at the image's centre) to the atlas frame.
         thickness_mm: [K].
         pixel_mm: edge of the square pixels.
         size: pixels per edge, N.
@@ -90,7 +90,7 @@ def sample_masks(
     Args:
         head: the truth.
         index_from_atlas: [4, 4] voxel index from the atlas frame (mm).
-        pose: [K] atlas frame from the slices, whose origins are the images' centres.
+        pose: [K] poses that map the frame of each slice (origin at the image's centre) to the atlas frame.
         pixel_mm: edge of the square pixels.
         size: pixels per edge, N.
         threshold: of the soft mask; less makes the head larger.
@@ -123,7 +123,7 @@ def _sample_mask(soft_mask, axes, origin, pixel, size, threshold):
 
 @nb.njit(cache=True, fastmath=True)
 def trilinear(volume, x, y, z):
-    """Value of a volume at an index between voxels, in compiled code; zero outside."""
+    """Trilinear interpolation of a volume at a fractional index, in compiled code; zero outside."""
     if x < 0 or y < 0 or z < 0:
         return np.float32(0)
     i, j, k = int(x), int(y), int(z)

@@ -1,4 +1,4 @@
-"""Stacks planned on a head or at random, and the head's motion while they are acquired: poses without images."""
+"""Random slice poses without images: stacks planned on the head or at random, and motion during their acquisition."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ Array = NDArray[np.float64]
 
 N_STACKS_SHARE = {1: 0.15, 2: 0.15, 3: 0.4, 4: 0.15, 5: 0.08, 6: 0.07}
 PLANNED_SHARE = 0.7
-"""Share of sets whose stacks were planned on the head's own axes; the others have any orientation."""
+"""Share of sets whose stacks are planned along the axes of the head; the others have random orientations."""
 PLAN_TILT_DEG = 8.0
 CUT_SHARE = 0.12
-"""Share of stacks that do not cover the head."""
+"""Share of stacks that do not cover the whole head."""
 TIMED_SHARE = 0.3
-"""Share of sets that move as recorded heads do; the others follow the simulator's levels."""
+"""Share of sets with trajectories in time, recorded or modelled; the others use the motion levels of the simulator."""
 LEVEL_SHARE = {"none": 0.15, "mild": 0.25, "moderate": 0.35, "severe": 0.25}
 TIMED_OFFSET_DEG, TIMED_OFFSET_MM = 20.0, 5.0
-"""Stacks that follow a trajectory in time: largest standard deviation of a stack's rotation, and its translation's."""
+"""Offset of a whole stack that follows a trajectory in time: largest standard deviation of its rotation, and standard
+deviation of its translation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedSlices:
-    """Slices of several stacks before anything is imaged.
+    """Poses and thicknesses of the slices of several stacks.
 
     Args:
-        header_pose: [K] atlas frame from slice as the headers say.
-        true_pose: [K] atlas frame from slice, with motion.
+        header_pose: [K] poses that map slices to the atlas frame, by the headers.
+        true_pose: [K] poses that map slices to the atlas frame, with motion.
         thickness_mm: [K].
-        time_rank: [K] 0 to 1 within a stack; NaN where the order is not known.
+        time_rank: [K] acquisition rank, 0 to 1 within a stack; NaN if the order is unknown.
         stack_id: [K].
     """
 
@@ -47,7 +48,7 @@ class PlannedSlices:
     stack_id: NDArray[np.int64]
 
     def take(self, index: NDArray[np.int64]) -> PlannedSlices:
-        """Some of the slices."""
+        """The slices at the given indices."""
         return PlannedSlices(
             header_pose=self.header_pose.take(index),
             true_pose=self.true_pose.take(index),
@@ -63,13 +64,13 @@ def draw_stacks(
     n_stacks: int | None = None,
     recorded: Sequence[RecordedTrajectory] = (),
 ) -> PlannedSlices:
-    """All slices of one to six stacks that may meet the head.
+    """Random poses of all slices of one to six stacks that may cross the head.
 
-    The scanner's axes are taken as those of a head that did not move; only relations between headers are
-    used later, so nothing is lost by it.
+    The scanner frame is taken to be the frame of a head that has not moved. This loses no generality, because only
+    relative poses of headers are used later.
 
     Args:
-        corners_mm: [8, 3] of the box that holds the head, in the atlas frame.
+        corners_mm: [8, 3] corners of the head's bounding box, in the atlas frame.
         rng: source of randomness.
         n_stacks: None draws 1 to 6.
         recorded: trajectories to follow instead of the model's.
@@ -122,7 +123,7 @@ def _slice_depths(corner_depth_mm: Array, step_mm: float, rng: np.random.Generat
 
 
 def planned_rotation(axis: int, rng: np.random.Generator) -> Array:
-    """Columns x, y, normal of a stack on a head's axis: tilted a little, rotated in plane and flipped at random."""
+    """Axes (columns x, y, normal) of a stack along an axis of the head, with random tilt, turn in plane and flip."""
     normal = np.roll([1.0, 0.0, 0.0], axis) * rng.choice([-1.0, 1.0])
     x = np.roll(normal, 1)
     base = np.stack([x, np.cross(normal, x), normal], axis=1)

@@ -1,4 +1,4 @@
-"""Synthetic subjects of the prior network, and a folder that keeps them: reading one takes a hundredth of the time."""
+"""Synthetic subjects of the prior network, and a file cache of them; reading is about 100 times faster than making."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
 
 SYNTHESIS_VERSION = 6
-"""Raised whenever the synthesis changes, so that subjects of an earlier one are not taken. Slices have a version of
-their own (`SIMULATOR_VERSION`), which counts as well."""
+"""Version of the synthesis, raised whenever it changes, so that cached subjects of an earlier version are not used.
+Cached subjects also depend on the version of the simulated slices, `SIMULATOR_VERSION`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +26,14 @@ class SyntheticSubject:
     Args:
         coarse: [I, J, K] V_coarse.
         density: [I, J, K] M_rho, over whole slices.
-        share: [I, J, K] of the density whose masks say brain.
+        share: [I, J, K] brain share: masked density over density.
         sharp: [I, J, K] V_sharp.
-        template: [I, J, K] an atlas template fitted to what the slices saw.
-        outline: [I, J, K] share of brain in it.
+        template: [I, J, K] an atlas template fitted to the seen part of the head.
+        outline: [I, J, K] share of brain in the fitted template.
         truth: [I, J, K], zero outside the mask.
         mask: [I, J, K] the head.
-        n_stacks: stacks that it was made from.
-        thickness_mm: of the slices, which is that of all stacks.
+        n_stacks: number of stacks.
+        thickness_mm: slice thickness, the same for all stacks.
     """
 
     coarse: NDArray[np.float32]
@@ -49,11 +49,11 @@ class SyntheticSubject:
 
 
 class SubjectCache:
-    """Subjects as files in a folder; volumes as float16, which is finer than their noise.
+    """Cache of subjects as files in a folder; volumes are float16, whose resolution is finer than their noise.
 
     Args:
-        folder: made where it is missing.
-        spec: all that decides the subjects; another spec has files of other names.
+        folder: created if it does not exist.
+        spec: everything that determines the subjects; it is part of the file names.
 
     Raises:
         InputError: the folder cannot be made.
@@ -71,7 +71,7 @@ class SubjectCache:
         return self.folder / f"{self.prefix}-{epoch:05d}-{index:05d}.npz"
 
     def load(self, epoch: int, index: int) -> SyntheticSubject | None:
-        """The subject of that number, or None where it is not kept, or its file is damaged or lacks a field."""
+        """The subject (epoch, index), or None if it is not stored or its file is damaged or lacks a field."""
         try:
             with self._path(epoch, index).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 found = {name: file[name] for name in file.files}
@@ -89,12 +89,12 @@ class SubjectCache:
         return SyntheticSubject(**values)
 
     def save(self, epoch: int, index: int, subject: SyntheticSubject) -> None:
-        """Keep a subject; its file appears whole or not at all.
+        """Store a subject; its file is written atomically.
 
         Args:
-            epoch: of the subject's number.
-            index: of the subject's number.
-            subject: to keep.
+            epoch: epoch of the subject.
+            index: index of the subject in its epoch.
+            subject: to store.
 
         Raises:
             InputError: the folder is full or cannot be written.

@@ -1,6 +1,6 @@
-"""Datasets whose items are made on the fly from heads, and the order in which a training asks for them.
+"""Datasets whose items are made on the fly from heads, and the sampler that sets the order of items in a training.
 
-An item is a function of the seed, the epoch and the index alone, whatever process or order makes it.
+An item depends only on the seed, the epoch and the index, not on the process or the order in which items are made.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Item = TypeVar("Item")
 
 
 class SubjectDataset(Dataset[Item], Generic[Item]):
-    """Items from heads; number n is (epoch, index) = divmod(n, length).
+    """Dataset of items made from heads; item number n is (epoch, index) = divmod(n, length).
 
     Args:
         subjects: atlas subjects or phantoms; loaded on first use and kept in memory.
         length: items per epoch.
         seed: of the whole dataset.
-        in_order: for validation: subjects in turn instead of drawn, and items are kept once made.
+        in_order: for validation: subjects are taken in turn instead of at random, and items are kept in memory.
     """
 
     def __init__(self, subjects: Sequence[Subject], length: int, seed: int, in_order: bool = False) -> None:
@@ -75,14 +75,14 @@ class SubjectDataset(Dataset[Item], Generic[Item]):
 
 
 class EpochSampler(Sampler[int]):
-    """Numbers epoch * length + index, one epoch further each time it is iterated.
+    """Sampler of the item numbers epoch * length + index; each iteration yields the next epoch.
 
     Args:
         length: items per epoch, over all processes.
-        epoch: to begin with.
-        now: gives the epoch when it is iterated; None counts.
+        epoch: first epoch.
+        now: returns the epoch at the start of an iteration; None counts iterations instead.
         rank: of this process.
-        n_ranks: processes that train together. Each has numbers of its own, and as many as the others.
+        n_ranks: processes that train together. Each gets different numbers, and all get the same amount.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class EpochSampler(Sampler[int]):
         return max(1, self.length // self.n_ranks)
 
     def __iter__(self) -> Iterator[int]:
-        # a generator: loaders ask for an iterator more than once before they begin
+        # a generator, so that the epoch advances only when items are taken: loaders may make several iterators first
         if self.now is not None:
             self.epoch = self.now()
         first = self.epoch * self.length
@@ -108,9 +108,9 @@ class EpochSampler(Sampler[int]):
 
 
 def epoch_of(trainer: Any, n_batches: int) -> Callable[[], int] | None:
-    """A function that gives the epoch of a trainer; None without a trainer.
+    """A function that returns the current epoch of a trainer; None without a trainer.
 
-    Loaders are made before a checkpoint is read that holds the epoch, so the epoch is looked up later.
+    Loaders are made before a checkpoint with the epoch is read, so the epoch must be looked up later.
 
     Args:
         trainer: of Lightning, or None.
@@ -118,5 +118,5 @@ def epoch_of(trainer: Any, n_batches: int) -> Callable[[], int] | None:
     """
     if trainer is None:
         return None
-    # an epoch that ended with the checkpoint is counted by its steps first
+    # after a checkpoint at the end of an epoch, current_epoch still lags behind the steps
     return lambda: max(trainer.current_epoch, trainer.global_step // n_batches)

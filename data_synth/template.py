@@ -1,4 +1,4 @@
-"""Mean heads by age, made from the training subjects: what `AtlasTemplate` holds."""
+"""Atlas templates: mean heads by age, made from the training subjects."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def atlas_templates(
     weeks: Sequence[float] = TEMPLATE_WEEKS,
     unknown_weeks: float | None = None,
 ) -> AtlasTemplate:
-    """Mean heads in the atlas frame: centred, normalised, averaged over near ages, left-right symmetric.
+    """Mean heads in the atlas frame: centred, normalised, averaged over similar ages, left-right symmetric.
 
-    Each subject is brought to the template's voxel size, its mask's centroid to the origin and its 99.5th
-    percentile to 1. Axes are taken as they are: both atlases and the phantom are RAS with the mid-sagittal
-    plane at constant x. An age without a subject within two weeks is skipped.
+    Each subject is resampled to the template's voxel size, with its mask's centroid at the origin and its 99.5th
+    percentile at 1. Subjects are not rotated: both atlases and the phantom are RAS with the mid-sagittal plane at
+    constant x. An age without a subject within two weeks is skipped.
 
     Args:
         subjects: to average.
         spacing_mm: isotropic voxel size of the template.
-        weeks: gestational ages wanted.
+        weeks: gestational ages of the templates.
         unknown_weeks: age of subjects whose names have none.
 
     Raises:
-        InputError: no subject near any of the ages, or a subject without an age in its name, and no `unknown_weeks`.
+        InputError: no subject near any of the ages, or no `unknown_weeks` for a subject without an age in its name.
     """
     ages = np.array([weeks_of(subject, unknown_weeks) for subject in subjects])
     members = {w: np.flatnonzero(np.abs(ages - w) <= HALF_WINDOW_WEEKS + 1e-6) for w in weeks}
@@ -70,7 +70,7 @@ def atlas_templates(
 
 
 def _common_grid(heads: Sequence[TruthVolume], spacing_mm: float) -> VolumeGrid:
-    """The grid about the origin that holds every head; the same reach on both sides of each axis."""
+    """The smallest grid that holds every head and is symmetric about the origin along each axis."""
     reach = np.zeros(3)
     for head in heads:
         corners = np.array([[0, 0, 0], np.array(head.data.shape) - 1])

@@ -1,4 +1,4 @@
-"""Motion in time as fetuses move: recorded trajectories, or a random model with their statistics."""
+"""Fetal head motion in time: recorded trajectories, or a random model with their statistics."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SAMPLE_SECONDS = 7.0
 """Interval of the recorded trajectories and of the model."""
 
 # Fitted to the 154 trajectories of fetal heads (19,661 steps of 7 s) in traj_flat.npz, the file that comes
-# with SVoRT (Xu et al., MICCAI 2022). The mean square rotation grows with the lag (72, 98, 138, 189 deg^2 per
-# axis after 1, 2, 4, 8 steps), which splits into white tracking noise (46 deg^2), which is not modelled, and a
-# walk of 15 to 25 deg^2 per step; the quiet steps (under 4 deg) have 1.4 deg and 1.3 mm per axis.
+# with SVoRT (Xu et al., MICCAI 2022). The mean square rotation grows with the lag: 72, 98, 138, 189 deg^2 per
+# axis after 1, 2, 4, 8 steps. It splits into white tracking noise (46 deg^2), which is not modelled, and a random
+# walk of 15 to 25 deg^2 per step. Quiet steps (under 4 deg) have 1.4 deg and 1.3 mm per axis.
 QUIET_DEG = 1.2
 QUIET_MM = 0.8
 JERK_SHARE = 0.06
-"""Share of steps over five times their trajectory's median."""
+"""Share of jerks: steps larger than five times the median step of their trajectory."""
 JERK_DEG = 15.0
 JERK_MM = 6.0
 SPREAD_BETWEEN_SUBJECTS = 0.42
@@ -35,7 +35,7 @@ SPREAD_BETWEEN_SUBJECTS = 0.42
 
 @dataclass(frozen=True)
 class RecordedTrajectory:
-    """One head tracked in time: `rotation` [T, 3, 3] and `translation_mm` [T, 3], every 7 s."""
+    """A tracked head: `rotation` [T, 3, 3] and `translation_mm` [T, 3], every 7 s."""
 
     rotation: Array
     translation_mm: Array
@@ -64,7 +64,7 @@ def load_trajectories(path: str | Path) -> list[RecordedTrajectory]:
 
 
 def modelled_trajectory(n_samples: int, rng: np.random.Generator) -> RecordedTrajectory:
-    """A random walk of small steps and rare large ones, with the recorded trajectories' statistics."""
+    """A random walk of small steps and rare jerks, with the statistics of the recorded trajectories."""
     activity = np.exp(rng.normal(0, SPREAD_BETWEEN_SUBJECTS))
     jerk = rng.random((n_samples, 1)) < JERK_SHARE
     angle_deg = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_DEG, QUIET_DEG) * activity
@@ -84,14 +84,14 @@ def timed_trajectory(
     rng: np.random.Generator,
     recorded: Sequence[RecordedTrajectory] = (),
 ) -> RigidPose:
-    """True motion of each slice of one stack about the origin: a piece of a trajectory in time, without its mean.
+    """True motion of each slice of one stack about the origin: a section of a trajectory, with its mean removed.
 
     Args:
         n_slices: K.
         seconds_per_slice: time between two slices.
         interleave: see `acquisition_order`.
         rng: source of randomness.
-        recorded: trajectories to cut the piece from; none takes the model.
+        recorded: trajectories from which the section is cut; an empty list uses the model.
 
     Returns:
         K poses in the order of the slices in space.

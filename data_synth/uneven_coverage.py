@@ -1,4 +1,4 @@
-"""Parts of a head that no slice looks at: runs of missing slices, and fields of view that cut the head."""
+"""Simulated gaps in coverage: runs of missing slices, and fields of view that cut the head."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.stacks import Stack
 
 EVEN_SHARE = 0.3
-"""Share of subjects of whom all slices are there."""
+"""Share of subjects with complete stacks."""
 CUT_SHARE = 0.5
-"""Share of the others whose stacks are cut by their fields of view; the rest misses slices. One in five has both."""
+"""Share of incomplete subjects whose stacks are cut by their fields of view; the others have missing slices."""
 BOTH_SHARE = 0.2
+"""Share of incomplete subjects with both defects."""
 CONCERNED_SHARE = 0.75
-"""Share of the stacks of an uneven subject that miss something."""
+"""Share of a subject's stacks that are incomplete; a cut on the same side (`SAME_SIDE_SHARE`) affects all stacks."""
 MISSING_SLICES = (1, 8)
-"""Length of a run of missing slices; a stack keeps at least `MIN_SLICES` of the masked ones."""
+"""Range of the length of a run of missing slices."""
 MIN_SLICES = 4
+"""Least number of masked slices that a stack keeps, and of masked rows or columns."""
 CUT = (0.2, 0.6)
 """Share of the head's extent that a field of view leaves out."""
 SAME_SIDE_SHARE = 0.6
-"""Share of cut subjects whose stacks all miss the same side of the head, as when the plan was too small."""
+"""Share of cut subjects whose stacks all miss the same side of the head, as from a plan that was too small."""
 
 
 def with_uneven_coverage(stacks: Sequence[SimulatedStack], rng: np.random.Generator) -> list[SimulatedStack]:
-    """Stacks of which some miss slices, or are cut by their fields of view.
+    """Stacks some of which lack slices or are cut by their fields of view.
 
-    Missing slices stay in the stack and are zero, as blanked slices are in files, so that numbers and poses of
-    slices keep their meaning. A cut along the slices does the same with all slices beyond; a cut in plane makes the
-    images smaller.
+    Missing slices remain in the stack as zeros, like blanked slices in files, so that slice numbers and poses stay
+    valid. A cut through the stack blanks all slices beyond it; an in-plane cut makes the images smaller.
 
     Args:
         stacks: as simulated, with masks.
@@ -52,7 +53,7 @@ def with_uneven_coverage(stacks: Sequence[SimulatedStack], rng: np.random.Genera
 
 
 def emptied(stack: Stack, first: int, last: int) -> Stack:
-    """A stack whose slices `first` to `last` - 1 were never acquired: zero, with empty masks; as it is if none is left.
+    """A stack with slices `first` to `last` - 1 blanked (zero, with empty masks); unchanged if no mask would be left.
 
     Args:
         stack: to change.
@@ -65,7 +66,7 @@ def emptied(stack: Stack, first: int, last: int) -> Stack:
 
 
 def without_slices(one: SimulatedStack, first: int, last: int) -> SimulatedStack:
-    """A simulated stack with slices `first` to `last` - 1 emptied; see `emptied`.
+    """A simulated stack with slices `first` to `last` - 1 blanked; see `emptied`.
 
     Args:
         one: to change.
@@ -102,7 +103,7 @@ def _with_cuts(stacks: Sequence[SimulatedStack], rng: np.random.Generator) -> li
 
 
 def _cut(one: SimulatedStack, direction: NDArray[np.float64], share: float) -> SimulatedStack:
-    """A stack without the part of the head that lies furthest along a direction, cut square to its nearest axis."""
+    """A stack without the end of the head in a direction, cut perpendicular to the stack axis closest to it."""
     stack = one.stack
     axes = stack.affine[:3, :3] / stack.spacing_mm
     along = axes.T @ direction
@@ -121,7 +122,7 @@ def _cut(one: SimulatedStack, direction: NDArray[np.float64], share: float) -> S
 
 
 def _cropped(stack: Stack, axis: int, kept: slice) -> Stack | None:
-    """The stack with fewer rows or columns; None where no head would be left."""
+    """The stack with fewer rows or columns; None if no masked pixel would be left."""
     box = tuple(kept if other == axis else slice(None) for other in range(3))
     mask = stack.mask[box]
     if not mask.any():

@@ -1,1 +1,4 @@
-"""Measurements for the documents: a folder per page. `python -m studies.PAGE.NAME`, or `make study-NAME`."""
+"""Studies that measure the tables of docs/, a folder per page.
+
+`make study-PAGE.NAME`, or `python -m studies.PAGE.NAME`.
+"""

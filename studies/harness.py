@@ -1,7 +1,7 @@
-"""Common part of all studies: options, a record that an interrupted run resumes, tables and the end of a command.
+"""Common command of all studies: options, a record from which an interrupted run resumes, tables, exit code.
 
-A study consists of what is special to it: its cases as tasks, what is measured, its tables and its figure. See
-`Study`; `python -m studies.PAGE.NAME --help` lists the options of each.
+A study itself defines only its tasks, its measurement, its tables and its figure; see `Study`.
+`python -m studies.PAGE.NAME --help` lists the options of each.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Task:
 
     Attributes:
         key: name of its row in the record.
-        call: measures; returns the row, or None where there is none (it has printed why). A row with an entry
-            "skipped" is tried again by the next run. With --jobs the call runs in another process.
+        call: function that measures. It returns the row, or None without a result (after printing why). A row with an
+            entry "skipped" is tried again by the next run. With --jobs the call runs in another process.
         arguments: of the call.
     """
 
@@ -49,7 +49,7 @@ class Task:
 
 
 def positive(text: str) -> int:
-    """A whole number of at least 1, as the type of an option."""
+    """Option type: an integer of at least 1."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text}; expected at least 1")
     return int(text)
@@ -65,30 +65,30 @@ SHARED: dict[str, dict[str, Any]] = {
     "--cases": {"nargs": "+", "metavar": "GLOB", "default": ["*"], "help": "parts of the names of cases"},
     "folders": {"nargs": "*", "metavar": "CASE", "type": Path, "help": "of g3r-simulate (none: sta30-moderate)"},
 }
-"""Options that several studies take, each always with the same meaning."""
+"""Options that several studies have in common, with the same meaning in each."""
 
 FITS = ("--preset", "--ckpt", "--threads")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A study, without what all have in common.
+    """Definition of one study: everything that differs between studies.
 
     Attributes:
         name: PAGE.NAME, the module in `studies`.
-        about: for --help.
-        tasks: the measurements, from the options.
-        tables: from the record, Markdown by the name of the markers in the document.
-        document: in docs/, where --publish puts the tables; None publishes nothing.
-        picture: in docs/images/, the figure of --publish.
-        shared: those of `SHARED` that it takes.
-        options: its own, as arguments of `add_argument` by their name.
-        settings: what rows depend on apart from the preset, weights, threads, jobs and --development.
-        line: what is printed for a new row; its key and seconds when None.
+        about: description for --help.
+        tasks: function that makes the measurements from the options.
+        tables: function that makes Markdown tables from the record, by the name of their markers in the document.
+        document: file in docs/ into which --publish writes the tables; None publishes nothing.
+        picture: file in docs/images/ for the figure of --publish.
+        shared: names of the options of `SHARED` that the study takes.
+        options: its own options, as arguments of `add_argument` by their name.
+        settings: settings that rows depend on apart from the preset, weights, threads, jobs and --development.
+        line: text that is printed for a new row; None prints its key and seconds.
         figure: draws the record into `options.figure`.
         finish: changes the record after the measurements.
-        resumes: False measures everything anew each time.
-        verdict: False ends the command with 1.
+        resumes: False repeats all measurements in each run.
+        verdict: function of the record; a result of False makes the exit code 1.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Study:
     verdict: Callable[[Record], bool] | None = None
 
     def parser(self) -> argparse.ArgumentParser:
-        """All its options."""
+        """Parser with all options of the study."""
         parser = argparse.ArgumentParser(
             prog=f"python -m studies.{self.name}",
             description=f"{self.about} The record is kept in --output, and a later run goes on with it.",
@@ -126,7 +126,7 @@ class Study:
         return parser
 
     def main(self, argv: Sequence[str] | None = None) -> int:
-        """Run the command; returns its exit code. An error of g3r's is one line and its own code."""
+        """Run the command; returns its exit code. An error of g3r is printed as one line and sets its exit code."""
         options = self.parser().parse_args(argv)
         logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
         try:
@@ -139,7 +139,7 @@ class Study:
             return 130
 
     def run(self, options: argparse.Namespace) -> int:
-        """Measure what the record does not hold; write record, tables and figure; returns the exit code."""
+        """Measure the rows that the record lacks; write record, tables and figure; returns the exit code."""
         if options.publish and self.document:
             options.docs = options.docs or DOCS / self.document
             if self.picture:
@@ -213,12 +213,12 @@ def stated(text: str, record: Record) -> str:
 
 
 def left_text(n_done: int, n_all: int, seconds: float) -> str:
-    """How much of a run is left, for the end of a line; nothing after its last measurement.
+    """Remaining measurements and time of a run, for the end of a progress line; empty after the last measurement.
 
     Args:
         n_done: measurements of this run so far.
         n_all: measurements of this run.
-        seconds: that it has taken so far.
+        seconds: time of this run so far.
     """
     if n_done == n_all:
         return ""
@@ -227,11 +227,11 @@ def left_text(n_done: int, n_all: int, seconds: float) -> str:
 
 
 def resumed(path: Path, new: Record, renewed: set[str]) -> Record:
-    """The record of an earlier run with the same settings, or the new one.
+    """The record of an earlier run with the same settings, or the new record.
 
     Args:
-        path: of the record, whether it is there or not.
-        new: settings, machine and no rows.
+        path: of the record; the file need not exist.
+        new: record with settings and machine, without rows.
         renewed: keys of rows that are to be measured again.
 
     Raises:
@@ -257,17 +257,17 @@ def resumed(path: Path, new: Record, renewed: set[str]) -> Record:
 
 
 def commits(rows: Mapping[str, Row]) -> str:
-    """The commits that rows were measured with, each once, in their order."""
+    """The commits that rows were measured with, without duplicates, in the order of the rows."""
     return ", ".join(dict.fromkeys(str(row["commit"] or "unknown") for row in rows.values()))
 
 
 def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[tuple[Task, Row | None]]:
-    """Each task with its row, as they end.
+    """Run tasks and yield each with its row as it finishes.
 
     Args:
-        tasks: what is to be measured.
-        jobs: processes; with 1 everything runs in this one.
-        threads: of each; None leaves them as they are.
+        tasks: to run.
+        jobs: number of processes; 1 runs everything in this process.
+        threads: per process; None does not change them.
     """
     if jobs == 1 or len(tasks) < 2:
         if threads:
@@ -275,7 +275,7 @@ def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[t
         for task in tasks:
             yield task, task.call(*task.arguments)
         return
-    # a fresh interpreter for each worker: thread pools do not survive a fork
+    # a fresh interpreter for each worker, because thread pools do not survive a fork
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, spawn, initializer=begin_worker, initargs=(threads or 1,)) as pool:
         waiting = {pool.submit(task.call, *task.arguments): task for task in tasks}
@@ -283,12 +283,12 @@ def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[t
             for done in as_completed(waiting):
                 yield waiting[done], done.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # what is left would be measured for nothing
+            pool.shutdown(wait=False, cancel_futures=True)  # results of the remaining tasks would be lost
             raise
 
 
 def weights(checkpoint: str | None) -> str:
-    """The first 16 digits of the SHA-256 of a prior's file: which weights rows were made with.
+    """The first 16 digits of the SHA-256 of a prior's file, which identify the weights that rows were measured with.
 
     Raises:
         InputError: no such file.

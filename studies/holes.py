@@ -1,4 +1,4 @@
-"""Slices that a stack of a study misses."""
+"""Holes: missing slices of the stacks of a study."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from g3r.acquisition.stacks import Stack
 
 @dataclass(frozen=True)
 class Hole:
-    """What one stack misses of its masked slices.
+    """A run of missing slices among the masked slices of one stack.
 
     Args:
         stack: number of the stack.
-        first: where it begins, as a share of the masked slices.
-        last: where it ends, as a share.
+        first: start of the run, as a share of the masked slices.
+        last: end of the run, as a share of the masked slices.
         n_slices: length in slices, in place of `last`.
     """
 
@@ -29,11 +29,11 @@ class Hole:
 
 
 def with_holes(stacks: Sequence[Stack], holes: Sequence[Hole]) -> tuple[Stack, ...]:
-    """The stacks without the slices of the holes, which stay in them as zeros with empty masks.
+    """The stacks with the slices of the holes blanked: zeros with empty masks.
 
     Args:
-        stacks: whole.
-        holes: at most one of each stack.
+        stacks: complete stacks.
+        holes: at most one per stack.
     """
     result = list(stacks)
     for hole in holes:

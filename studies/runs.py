@@ -1,4 +1,4 @@
-"""One subject through registration, or through the whole reconstruction, with errors, scores and seconds."""
+"""Registration or whole reconstruction of one subject, with errors, scores and seconds."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from studies.harness import Row
 from studies.subjects import read_case
 
 BAD_MEDIAN_MM = 1.0
-"""A subject whose median slice is further off than this counts as not registered."""
+"""A subject counts as not registered if the median pose error of its slices is larger than this."""
 
 OFF_MM, BAD_OFF_SHARE = 2.0, 0.05
-"""A volume is not to be relied on where more than this share of what it is made of is further off."""
+"""A volume is unreliable if more than BAD_OFF_SHARE of the brain in its slices is misplaced by more than OFF_MM."""
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -41,18 +41,18 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 def run(
     case: SimulatedCase, options: argparse.Namespace, changes: Mapping[str, Any] = NOTHING, *, full: bool
 ) -> tuple[PoseError, Row]:
-    """Registration alone, as the reconstruction begins with it, or all of it with its volume scored.
+    """Run registration alone, or the whole reconstruction and score its volume.
 
     Args:
         case: the subject.
-        options: of the command; its preset and prior count.
+        options: of the command; preset and prior are used.
         changes: of the settings (see `g3r.planning.presets.changed`).
         full: whether the whole reconstruction is run.
 
     Returns:
-        Errors of the poses, and all figures as `pose_row` has them; `off_share` and `crossing_deg` are those of the
-        functions of these names, `orientation_deg` the angle between the frame of the poses and that of the atlas,
-        `stage_seconds` wall time of each stage of a reconstruction.
+        Errors of the poses, and a row with the entries of `pose_row` and more: `off_share` and `crossing_deg` from the
+        functions of these names, `orientation_deg` the angle between the frame of the poses and the atlas frame,
+        `stage_seconds` the wall time of each stage of a reconstruction.
     """
     reconstructor = GaussianReconstructor(options.ckpt, changed(PRESETS[options.preset], changes))
     start = time.perf_counter(), time.process_time()
@@ -76,12 +76,12 @@ def run(
 
 
 def pose_row(error: PoseError, warnings: Sequence[str], seconds: float, cpu_seconds: float) -> Row:
-    """Figures of poses, without the slices.
+    """Summary figures of pose errors, without the errors of single slices.
 
     Args:
         error: of the poses.
-        warnings: of g3r about them.
-        seconds: wall time of what was run.
+        warnings: of g3r about the poses.
+        seconds: wall time of the run.
         cpu_seconds: of all threads.
     """
     return {
@@ -98,12 +98,12 @@ def pose_row(error: PoseError, warnings: Sequence[str], seconds: float, cpu_seco
 
 
 def off_share(error_mm: Mapping[SliceKey, float], slices: Slices, weight: NDArray[np.float64]) -> float:
-    """Share of the brain in slices that are used and whose place is known, that is further off than `OFF_MM`.
+    """Share of the brain misplaced by more than `OFF_MM`, among slices that are used and whose true pose is known.
 
     Args:
-        error_mm: of the slices whose place is known.
+        error_mm: pose error of each slice whose true pose is known.
         slices: K slices.
-        weight: [K] of the slices; those of `DOWNWEIGHTED_BELOW` or more are used.
+        weight: [K] slice weights; slices with at least `DOWNWEIGHTED_BELOW` are used.
     """
     keys = list(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))
     area = np.bincount(slices.pixel_plane, minlength=len(keys)) * (weight >= DOWNWEIGHTED_BELOW)
@@ -122,27 +122,27 @@ def aligned(
 ) -> Comparison:
     """A volume compared with the truth after rigid alignment.
 
-    The volume may be oriented too differently from the truth for alignment: the common motion of the slices
-    is applied first. `alignment` of the comparison starts from there.
+    The orientations of volume and truth may differ too much for the alignment, so the common motion of the slices
+    is applied first. `alignment` of the comparison is relative to it.
 
     Args:
         case: with the truth.
         data: [I, J, K] of the volume.
         grid: of the data.
         truth_from_volume: the common motion of the slices (`PoseError.common`).
-        near: whether to rely on it, which is quicker where a volume is unlike the truth (`align_rigid`).
+        near: whether to rely on the common motion, which is faster for a volume unlike the truth (`align_rigid`).
     """
     volume = Volume(data, grid.moved(truth_from_volume).affine, case.name)
     return compare(volume, case.truth, case.truth_mask, align=True, near=near)
 
 
 def figures(scores: Scores) -> dict[str, float]:
-    """Scores that the tables show, as plain numbers."""
+    """The scores shown in tables, as plain numbers."""
     return {"psnr_db": round(scores.psnr_db, 4), "ssim": round(scores.ssim, 5)}
 
 
 def orientation_deg(case: SimulatedCase, truth_from_result: RigidPose) -> float:
-    """Angle between a result's frame and that of the atlas, which the voxel axes of the truth keep."""
+    """Angle between a result's frame and the atlas frame, whose axes are the voxel axes of the truth."""
     axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
     turn = RigidPose((axes.T @ truth_from_result.rotation[0])[None], np.zeros((1, 3)))
     return float(np.rad2deg(np.linalg.norm(turn.rotvec_rad())))
@@ -150,11 +150,11 @@ def orientation_deg(case: SimulatedCase, truth_from_result: RigidPose) -> float:
 
 @functools.lru_cache(maxsize=1)
 def registered_once(folder: Path, preset: str, checkpoint: str | None) -> Registration:
-    """The registration that all fits of a case share.
+    """The registration of a case, cached for all fits of it.
 
     Args:
         folder: of the case.
-        preset: its settings.
-        checkpoint: of the prior; None takes the one shipped.
+        preset: name of the settings.
+        checkpoint: of the prior; None takes the shipped prior.
     """
     return GaussianReconstructor(checkpoint, PRESETS[preset]).register_stacks(read_case(folder).stacks)

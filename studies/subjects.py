@@ -1,4 +1,4 @@
-"""Subjects of the studies: simulated subjects, kept in a folder, and the cases of the test data."""
+"""Subjects of the studies: simulated subjects, cached in a folder, and the cases of the test data."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ BRIGHT = 1000.0
 """The 99.5th percentile of the truth in the mask; stacks are int16."""
 
 STRETCH = 0.05
-"""Each axis of a subject is longer or shorter by at most this share."""
+"""Each axis of a subject is stretched or shortened by at most this share."""
 
 RECORD_NAME = "simulation.json"
 
 THICKNESS_MM = {"sb28-mild-gap": 3.0}
-"""Cases whose slices are thinner than their distance and that have no simulation.json to say so."""
+"""Slice thickness of cases whose slices are thinner than their spacing and that have no simulation.json to state it."""
 
 ORDER = ("*-none", "*-mild*", "*-moderate", "*-severe", "*-single")
 
@@ -41,16 +41,16 @@ USUAL_CASE = "sta30-moderate"
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectSpec:
-    """All that decides a simulated subject.
+    """Specification of a simulated subject.
 
     Args:
         name: folder in the cache; by default motion, seed and the last part of the volume.
-        volume: subject of the atlas tree, as in `find_subjects`.
+        volume: name of an atlas subject, as in `find_subjects`.
         motion: mild, moderate or severe.
         seed: of the stretch and of the simulation.
         bias: strength of the bias field.
         stretch: bound of the random stretch of each axis.
-        turned: whether the head is in a random orientation instead of the atlas's.
+        turned: whether the head has a random orientation instead of that of the atlas.
     """
 
     name: str = ""
@@ -66,14 +66,14 @@ class SubjectSpec:
             object.__setattr__(self, "name", f"{self.motion}-{self.seed}-{self.volume.rsplit('/', 1)[-1]}")
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """How its stacks are taken."""
+        """Acquisition settings of its stacks."""
         return orthogonal_settings(n_stacks, self.motion, bias=self.bias)
 
     def truth(self, atlas: Path | None) -> TruthVolume:
-        """Its volume, as the atlas has it.
+        """Its volume as in the atlas.
 
         Args:
-            atlas: folder of the atlas; only what comes from none needs none.
+            atlas: folder of the atlas; None for a subject that does not come from an atlas.
 
         Raises:
             InputError: the atlas lacks the volume.
@@ -84,12 +84,12 @@ class SubjectSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SizedSubject(SubjectSpec):
-    """A subject whose stacks are of a size of their own.
+    """A subject with its own pixel size, slice thickness and gap.
 
     Args:
         pixel_mm: in-plane spacing.
         thickness_mm: of a slice.
-        gap_mm: between slices.
+        gap_mm: between the facing edges of neighbouring slices.
     """
 
     pixel_mm: float
@@ -97,7 +97,7 @@ class SizedSubject(SubjectSpec):
     gap_mm: float = 0.0
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """How its stacks are taken."""
+        """Acquisition settings of its stacks."""
         usual = super().acquisition(n_stacks)
         return [
             replace(one, resolution_mm=self.pixel_mm, thickness_mm=self.thickness_mm, gap_mm=self.gap_mm)
@@ -106,10 +106,10 @@ class SizedSubject(SubjectSpec):
 
 
 def data_folder(part: str) -> Path:
-    """`atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` next to the repository.
+    """Folder `atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` next to the repository.
 
     Raises:
-        InputError: there is none.
+        InputError: the folder does not exist.
     """
     folder = Path(os.environ.get("G3R_TEST_DATA", REPOSITORY.parent / "shared" / "data")) / part
     if not folder.is_dir():
@@ -118,7 +118,7 @@ def data_folder(part: str) -> Path:
 
 
 def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path]:
-    """The cases of the test data whose name has a part that matches a pattern, from no motion to much.
+    """The cases of the test data whose name has a part that matches a pattern, by increasing motion.
 
     Raises:
         InputError: none matches.
@@ -131,12 +131,12 @@ def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path
 
 
 def chosen_folders(folders: Sequence[Path]) -> Sequence[Path]:
-    """The folders that were given, or the case of the test data that represents all."""
+    """The given folders, or, without any, the representative case of the test data."""
     return folders or [data_folder("cases") / USUAL_CASE]
 
 
 def read_case(folder: Path, n_stacks: int | None = None) -> SimulatedCase:
-    """A case with its first stacks (None: all), with the thickness of its slices where no file says it."""
+    """A case with its first `n_stacks` stacks (None: all) and the slice thickness even if no file states it."""
     case = load_case(folder, THICKNESS_MM.get(folder.name))
     return replace(case, stacks=case.stacks[:n_stacks])
 
@@ -147,7 +147,7 @@ def simulated_case(spec: SubjectSpec, cache: Path, n_stacks: int | None = None) 
     Args:
         spec: of the subject.
         cache: folder of simulated subjects.
-        n_stacks: how many of its stacks to read, from the first; None for all.
+        n_stacks: number of its first stacks to read; None for all.
     """
     return read_case(simulated_subject(spec, data_folder("atlas"), cache), n_stacks)
 
@@ -157,14 +157,14 @@ def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Pat
 
     Args:
         spec: the subject.
-        atlas: folder of the atlas; None for a subject that comes from none.
+        atlas: folder of the atlas; None for a subject that does not come from an atlas.
         cache: folder of simulated subjects.
 
     Raises:
         InputError: the atlas lacks the volume, or the cache holds another subject of that name.
     """
     folder = cache / spec.name
-    # as it is read again: tuples are lists
+    # as JSON would return it: tuples become lists
     record = json.loads(json.dumps(asdict(spec) | {"simulator": SIMULATOR_VERSION}))
     if folder.is_dir():
         path = folder / RECORD_NAME
@@ -179,7 +179,7 @@ def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Pat
     settings = spec.acquisition(3)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     extra = {"thickness_mm": settings[0].thickness_mm, "interleave": settings[0].interleave}
-    # studies with several processes may want the same subject at the same time: the first to end has made it
+    # several processes may simulate the same subject at the same time; the first to finish keeps its folder
     made = cache / f".{spec.name}-{os.getpid()}"
     save_simulation(made, truth, stacks, {"spec": record, **extra})
     try:

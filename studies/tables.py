@@ -1,4 +1,4 @@
-"""Pieces of the studies' tables and figures."""
+"""Building blocks of the tables and figures of the studies."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Cell = str | Callable[[Any], object]
 
 
 def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Cell] | Sequence[tuple[str, Cell]]) -> str:
-    """A table in Markdown. A cell is empty where the row lacks a value that its format names.
+    """A table in Markdown. A cell is empty if the row lacks a value that its format names.
 
     Args:
         rows: values by name.
-        columns: cells by the head of the column; pairs where a head occurs twice.
+        columns: cells by column heading; pairs if a heading occurs twice.
     """
     listed = list(columns.items()) if isinstance(columns, Mapping) else columns
     return markdown_table([head for head, _ in listed], [[_cell(row, cell) for _, cell in listed] for row in rows])
@@ -38,12 +38,12 @@ def _cell(row: Mapping[str, Any], cell: Cell) -> object:
 
 
 def details(summary: str, *parts: str) -> str:
-    """Text in Markdown that is folded away below its summary."""
+    """Markdown that is collapsed below its summary."""
     return "\n\n".join([f"<details><summary>{summary}</summary>", *parts, "</details>"])
 
 
 def spread(values: Sequence[float], form: str = "{:.2f}") -> str:
-    """Mean and standard deviation; the mean alone of a single value, "-" of none."""
+    """Mean and standard deviation; a single value gives the mean alone, none gives "-"."""
     if not values:
         return "-"
     deviation = f" ± {form.replace('+', '').format(stdev(values))}" if len(values) > 1 else ""
@@ -51,7 +51,7 @@ def spread(values: Sequence[float], form: str = "{:.2f}") -> str:
 
 
 def marked(text: str, good: bool) -> str:
-    """The text, with (!) where something is not as wanted."""
+    """The text, with (!) unless `good`."""
     return text if good else f"{text} (!)"
 
 
@@ -76,7 +76,7 @@ def new_figure(size: tuple[float, float], **options: Any) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a PNG, whole or not at all; folders are made.
+    """Write a PNG atomically; missing folders are created.
 
     Args:
         figure: to write.

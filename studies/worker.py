@@ -1,4 +1,4 @@
-"""A process that measures for a study."""
+"""Worker process of a study."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from g3r.run.machine import use_up_to
 
 
 def begin_worker(threads: int) -> None:
-    """Set the threads of this process, and end it with the one that began it, also if that was killed.
+    """Set the threads of this process, and end it when its parent process ends, even if the parent was killed.
 
     Args:
-        threads: at most so many.
+        threads: largest number of threads.
     """
     use_up_to(threads)
     Thread(target=_end_with_parent, daemon=True).start()
@@ -21,6 +21,6 @@ def begin_worker(threads: int) -> None:
 
 def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
-    assert parent is not None  # a process without one would be no worker
+    assert parent is not None  # a worker always has a parent process
     parent.join()
     os._exit(1)

@@ -11,10 +11,10 @@ import pytest
 
 from tests.phantoms import simulate_small_subject
 
-# torch's threads wait for each other busily: on two cores with anything beside them, small networks take
-# ten times as long; commands that tests start choose their own number
+# torch's threads busy-wait for each other: on two cores with any other load, small networks take
+# ten times as long; commands started by tests choose their own number
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# and with several processes of tests numba's threads should not, either
+# with several test processes, numba's threads must not busy-wait either
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 pytest_plugins = ["tests.tally"]
@@ -47,5 +47,5 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of three small stacks of a phantom that moves a little; tests do not write to it."""
+    """Folder of three small stacks of a slightly moving phantom; tests must not write to it."""
     return simulate_small_subject(tmp_path_factory.mktemp("simulated") / "subject")

@@ -1,4 +1,4 @@
-"""The Dockerfile and the Apptainer recipe, taken apart."""
+"""Parsers of the Dockerfile and the Apptainer recipe."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ DOCKERFILE, APPTAINER = REPOSITORY / "Dockerfile", REPOSITORY / "apptainer.def"
 
 @dataclass(frozen=True)
 class Directive:
-    """A directive of a Dockerfile: its word, and what follows on its logical line."""
+    """A directive of a Dockerfile: its keyword, and the rest of its logical line."""
 
     word: str
     text: str
 
 
 def directives(path: Path = DOCKERFILE) -> list[Directive]:
-    """The directives in order, without comments, lines that go on joined."""
+    """The directives in order, without comments, with continued lines joined."""
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
     logical = re.sub(r"\\\n\s*", " ", "\n".join(lines)).splitlines()
     parts = [line.strip().split(maxsplit=1) for line in logical if line.strip()]
@@ -28,7 +28,7 @@ def directives(path: Path = DOCKERFILE) -> list[Directive]:
 
 
 def environment(path: Path = DOCKERFILE) -> dict[str, str]:
-    """What ENV sets, in the last stage."""
+    """Variables set by ENV in the last stage."""
     words = [word for one in directives(path) if one.word == "ENV" for word in one.text.split()]
     return dict(word.split("=", 1) for word in words)
 
@@ -46,7 +46,7 @@ def pip_commands(path: Path = DOCKERFILE) -> list[str]:
 
 
 def sections(path: Path = APPTAINER) -> dict[str, list[str]]:
-    """Lines of the recipe by section; those before the first section are under ""."""
+    """Lines of the recipe by section; lines before the first section are under ""."""
     found: dict[str, list[str]] = {"": []}
     name = ""
     for line in path.read_text(encoding="utf-8").splitlines():

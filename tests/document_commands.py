@@ -1,4 +1,4 @@
-"""The commands that README.md and docs/ show: found in their blocks of code, read by the commands' own parsers."""
+"""The commands shown in README.md and docs/: found in code blocks, parsed by the commands' own parsers."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ OTHERS = {
     "snakemake",
     "source",
     "wsl",
-    "g3r-envScriptsactivate",  # of Windows: a shell reads its backslashes away
+    "g3r-envScriptsactivate",  # for Windows: a POSIX shell removes its backslashes
 }
-"""Programs of others, which no test here runs."""
+"""Third-party programs, which no test runs."""
 
 THREE_STACKS = "ax.nii.gz cor.nii.gz sag.nii.gz"
 
 GOES_ON = {"g3r-bench", "g3r-bids"}
-"""Commands whose first parser leaves words to another."""
+"""Commands whose first parser leaves arguments to a second one."""
 
 
 class Parsed(Exception):
-    """The options of a command were understood."""
+    """Raised when the options of a command were parsed."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ class Shown:
 
     @property
     def words(self) -> list[str]:
-        """As a shell splits them, with a file for each "..." that follows an option."""
+        """Words as split by a shell, with a file for each "..." after an option."""
         line = self.line.replace("--masks ...", "--masks ax-mask.nii.gz cor-mask.nii.gz sag-mask.nii.gz")
         return shlex.split(re.sub(r"(?<=\w)\.\.\.", "", line.replace("--stacks ...", f"--stacks {THREE_STACKS}")))
 
     @property
     def is_synopsis(self) -> bool:
-        """Whether it says what may be left out."""
+        """Whether it marks optional parts."""
         return bool(re.search(r" \[[-\w]", self.line))
 
 
 def blocks(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Blocks of code with the name of their language, "" for indented ones."""
+    """Code blocks with the name of their language, "" for indented ones."""
     language, lines = "", list[str]()
     fenced = False
     for line in text.splitlines():
@@ -80,7 +80,7 @@ def blocks(text: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def commands(document: str, text: str) -> Iterator[Shown]:
-    """Every line for a shell; of indented blocks, which hold equations too, those of our own commands."""
+    """All shell lines; of indented blocks, which also hold equations, only lines of our own commands."""
     for language, lines in blocks(text):
         if language not in SHELLS | {""}:
             continue
@@ -92,7 +92,7 @@ def commands(document: str, text: str) -> Iterator[Shown]:
 
 
 def all_commands() -> list[Shown]:
-    """Those of all documents that are meant for users and developers."""
+    """The commands of all documents for users and developers."""
     paths = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
     return [
         one
@@ -103,7 +103,7 @@ def all_commands() -> list[Shown]:
 
 @cache
 def scripts() -> dict[str, str]:
-    """The commands of the package and where they are."""
+    """The commands of the package and their entry points."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return dict(project["scripts"])
 
@@ -115,10 +115,10 @@ def main_of(command: str) -> Any:
 
 
 def parse(words: list[str], patch: pytest.MonkeyPatch) -> None:
-    """Let a command read its options and do nothing else.
+    """Let a command parse its options and do nothing else.
 
     Raises:
-        SystemExit: they are not understood.
+        SystemExit: the options are invalid.
     """
     plain = argparse.ArgumentParser.parse_args
 
@@ -138,7 +138,7 @@ def parse(words: list[str], patch: pytest.MonkeyPatch) -> None:
 
 
 def check_training(words: list[str]) -> None:
-    """`g3r-pretrain fit --config FILE --a.b VALUE`: the file is there, and it or Lightning knows each option."""
+    """`g3r-pretrain fit --config FILE --a.b VALUE`: the file exists, and it or Lightning defines each option."""
     assert words[1] == "fit"
     assert words[2] == "--config"
     settings = yaml.safe_load((REPOSITORY / words[3]).read_text(encoding="utf-8"))

@@ -1,6 +1,6 @@
-"""Tables of README.md and docs/ that repeat measured figures: `python -m tests.figures` writes them all.
+"""Tables of README.md and docs/ that repeat measured figures; `python -m tests.figures` writes them all.
 
-They follow from the tables of docs/tradeoff.md, which studies measure, and from the table of messages of the verdict.
+They are derived from the tables of docs/tradeoff.md, which studies measure, and from the verdict's message table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WHAT = {
     "`balanced`": "measured slice profiles; two rounds of poses and volume for two stacks",
     "`accurate`": "the mean of six fits; a round of poses and volume, two for two stacks",
 }
-"""What the presets do, in the order of the table."""
+"""Descriptions of the presets, in the order of the table."""
 
 CASE = "sta30-moderate"
 
@@ -34,7 +34,7 @@ NESVOR = ("NeSVoR 0.6.0rc1", "`--registration stack`, 4,000 iterations", "22.31"
 
 
 def rows(text: str) -> Rows:
-    """The first table of a text; of columns with one name the later ones get a number."""
+    """The first table of a text; repeated headings get a number."""
     lines = re.search(r"(^\|.*\n?)+", text, flags=re.MULTILINE)
     assert lines
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[0].splitlines()]
@@ -49,7 +49,7 @@ def marked(path: Path, marker: str) -> Rows:
 
 
 def subjects() -> Rows:
-    """The subjects that no setting was chosen on, with three stacks."""
+    """The subjects that were not used to choose settings, with three stacks."""
     return [row for row in marked(TRADEOFF, "presets") if row["`preview`, dB"]]
 
 
@@ -60,7 +60,7 @@ def presets_table() -> str:
     lines = []
     for (name, what), column in zip(WHAT.items(), seconds, strict=True):
         two = [row for row in fewer if row["preset"] == name and row["stacks"] == "2"]
-        two = two if len(two) == len(three) else []  # a mean over some subjects would not compare with the others
+        two = two if len(two) == len(three) else []  # a mean over only some subjects would not be comparable
         took = [three_of[column] for three_of in three], [row["CPU s"] for row in two]
         lines.append(
             [
@@ -80,7 +80,7 @@ def _mean(texts: list[str], digits: int) -> str:
 
 
 def _left(table: str) -> str:
-    """Words are read from the left."""
+    """The table with all columns left-aligned."""
     return table.replace("---:", "---")
 
 
@@ -91,19 +91,19 @@ def measured(preset: str) -> list[str]:
 
 
 def peers_table(presets: Sequence[str] = ("`fast`", "`balanced`")) -> str:
-    """g3r and another program on one case."""
+    """Table of g3r and another program on one case."""
     lines = [[f"{NESVOR[0]}, {NESVOR[1]}", *NESVOR[2:]]]
     lines += [[f"g3r {preset}", *measured(preset)] for preset in presets]
     return markdown_table(["method", "PSNR, dB", "SSIM", "CPU seconds"], lines)
 
 
 def elsewhere_table() -> str:
-    """The other program alone."""
+    """Table of the other program alone."""
     return peers_table(())
 
 
 def short_peers_table() -> str:
-    """The same in the README, with what else one wants to know first."""
+    """Short table of g3r and the other program for the README, with the most important facts."""
     asked = ["DICOM in and out", "tells when not to use it", "other organs", "validated on patients"]
     lines = [
         ["g3r `balanced`", *measured("`balanced`"), "yes", "yes", "rigid ones", "**no**"],
@@ -119,7 +119,7 @@ TABLES = {
     (PAPER, "paper-elsewhere"): elsewhere_table,
     (messages_table.DOCUMENT, messages_table.MARKER): messages_table.table,
 }
-"""By document and marker."""
+"""Functions that make the tables, by document and marker."""
 
 
 if __name__ == "__main__":

@@ -4,6 +4,6 @@ from torch import Tensor
 
 
 def gradient_of(leaf: Tensor) -> Tensor:
-    """The gradient that a backward pass has left, which must be there."""
+    """The gradient of a leaf, which must exist."""
     assert leaf.grad is not None
     return leaf.grad

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 SMALL_SUBJECT = ("--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild")
-"""Options of g3r-simulate for three small stacks of a brain that moves a little."""
+"""Options of g3r-simulate for three small stacks of a slightly moving brain."""
 
 
 def simulate_small_subject(folder: Path, *further: str) -> Path:

@@ -1,4 +1,4 @@
-"""Which room of g3r may import which: read by tests/test_architecture.py, written into CONTRIBUTING.md.
+"""Allowed imports between the rooms of g3r, checked by tests/test_architecture.py and written into CONTRIBUTING.md.
 
 `python -m tests.rooms` writes the table between the markers of CONTRIBUTING.md, and counts rooms, floors and pairs.
 """
@@ -45,7 +45,7 @@ MAY_IMPORT = {
         "bids reuse report reconstruct"
     ),
 }
-"""From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""
+"""Rooms from the bottom up: a room imports only rooms that precede it here, and `errors` and `_version`."""
 
 DATA_SYNTH_MAY_IMPORT = {"geometry", "acquisition", "run"}
 
@@ -58,7 +58,7 @@ def allowed(room: str) -> set[str]:
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Dotted names of everything a file imports, wherever in the file."""
+    """Dotted names of all imports of a file, at any level."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     package = path.relative_to(REPOSITORY).with_suffix("").parts[:-1]
     names: set[str] = set()
@@ -73,7 +73,7 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def rooms_imported(path: Path) -> set[str]:
-    """The rooms of g3r that a file imports from, those open to all apart."""
+    """The rooms of g3r that a file imports from, except those open to all."""
     found = {name.split(".")[1] for name in imported_modules(path) if name.startswith("g3r.")}
     return (found & set(MAY_IMPORT)) - OPEN_TO_ALL
 
@@ -103,7 +103,7 @@ def with_table(text: str) -> str:
 
 
 def floor(room: str) -> int:
-    """How many rooms stand on each other up to this one: the longest chain of imports, the open rooms included."""
+    """Length of the longest chain of imports that ends at this room, including the open rooms."""
     below = set() if room in OPEN_TO_ALL else allowed(room) | OPEN_TO_ALL
     return 1 + max(map(floor, below), default=0)
 

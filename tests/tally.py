@@ -1,4 +1,4 @@
-"""Counts of the fault and numerics tests: cases tried, survived, refused and lost, printed when pytest ends.
+"""Counts of cases tried, survived, refused and lost in the fault and numerics tests, printed when pytest ends.
 
 A pytest plugin (`tests/conftest.py` loads it); use its fixture `tally` from any test:
 
@@ -13,10 +13,10 @@ A pytest plugin (`tests/conftest.py` loads it); use its fixture `tally` from any
         tally.add(tried=500, survived=120, refused=380)   # the rest, here 0, counts as lost
 
 Rows are named after the test's file (`tests/faults/test_kills.py` gives "kills"); `tally.named("...")` gives
-another name. *Survived* means: went on to a right result (also after a kill or a full disk, once run again).
+another name. *Survived* means: led to a right result (also when run again after a kill or a full disk).
 *Refused* means: ended with the documented exit code or error and nothing written. *Lost* is everything else:
-a traceback, a hang, a wrong exit code, a stray file, a result that is wrong or half there. pytest fails where
-anything was lost, even if a test forgot to.
+a traceback, a hang, a wrong exit code, a stray file, a wrong or incomplete result. pytest fails if
+anything was lost, even if no test failed.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ class Counts:
 
     @property
     def lost(self) -> int:
-        """Neither survived nor refused."""
+        """Cases that neither survived nor were refused."""
         return self.tried - self.survived - self.refused
 
 
 @dataclass
 class Case:
-    """One case that is being tried."""
+    """A case in progress."""
 
     was_refused: bool = False
 
     def refused(self) -> None:
-        """Say that the input was refused, as it should be."""
+        """Count the case as properly refused."""
         self.was_refused = True
 
 
@@ -64,11 +64,11 @@ class Tally:
     rows: dict[str, Counts] = field(default_factory=dict)
 
     def named(self, name: str) -> Tally:
-        """The same table, another row."""
+        """Another row of the same table."""
         return Tally(name, self.rows)
 
     def add(self, tried: int, survived: int = 0, refused: int = 0) -> None:
-        """Count many cases at once; what neither survived nor was refused is lost."""
+        """Count many cases at once; cases that neither survived nor were refused are lost."""
         row = self.rows.setdefault(self.name, Counts())
         row.tried += tried
         row.survived += survived
@@ -76,7 +76,7 @@ class Tally:
 
     @contextmanager
     def case(self) -> Iterator[Case]:
-        """Count one case; an error inside makes it a lost one, and goes on."""
+        """Count one case; an error inside makes it lost and is passed on."""
         case = Case()
         try:
             yield case
@@ -87,7 +87,7 @@ class Tally:
 
     @contextmanager
     def refusal(self) -> Iterator[None]:
-        """Count one case that has to end in an error of ours, or a ValueError, with a message."""
+        """Count one case that must raise an error of g3r, or a ValueError, with a message."""
         with self.case() as case:
             with pytest.raises((G3RError, ValueError), match=r"(?s).{10}"):
                 yield
@@ -95,7 +95,7 @@ class Tally:
 
 
 def table(rows: dict[str, Counts]) -> list[str]:
-    """The counts as lines of text, with a sum."""
+    """The counts as lines of text, with a total."""
     total = Counts(*(sum(getattr(row, name) for row in rows.values()) for name in ("tried", "survived", "refused")))
     width = max(len(name) for name in [*rows, "all"])
     lines = [f"{'':<{width}} {'tried':>7} {'survived':>9} {'refused':>8} {'lost':>5}"]
@@ -115,14 +115,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def tally(request: pytest.FixtureRequest) -> Tally:
-    """Counts cases in the row of the test's file; see the top of this file."""
+    """The row of the test's file; see the module docstring."""
     name = request.path.stem.removeprefix("test_").replace("_", " ")
     return Tally(name, request.config.stash[ROWS])
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
-    """Add up what a worker of pytest-xdist counted."""
+    """Add the counts of a worker of pytest-xdist."""
     for name, counts in getattr(node, "workeroutput", {}).get("tally", {}).items():
         Tally(name, node.config.stash[ROWS]).add(**counts)
 

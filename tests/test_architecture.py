@@ -1,4 +1,4 @@
-"""The rules of the house: which room may import which, what stays lazy, what the text may not say."""
+"""Architecture rules: imports between rooms, lazy imports, forbidden text."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def in_package(name: str) -> list[Path]:
 def test_imports_go_downwards_and_every_allowance_is_used() -> None:
     used: dict[str, set[str]] = {room: set() for room in MAY_IMPORT}
     for path in in_package("g3r"):
-        if room_of(path) != FRONT_DOOR:  # may name every room; that it stays lazy is tested below
+        if room_of(path) != FRONT_DOOR:  # it may import every room; its laziness is tested below
             used[room_of(path)] |= rooms_imported(path) - {room_of(path)}
     assert used == {room: allowed(room) for room in MAY_IMPORT}, "say in tests/rooms.py what a room imports"
 
@@ -75,7 +75,7 @@ def test_only_the_pretrain_command_knows_lightning() -> None:
 
 @pytest.mark.parametrize("path", in_package("data_synth"), ids=relative)
 def test_data_synth_uses_only_the_lower_rooms(path: Path) -> None:
-    # g3r-simulate fails as the other commands do
+    # g3r-simulate handles errors like the other commands
     own = {"cli"} if path.name == "cli.py" else set()
     assert rooms_imported(path) <= DATA_SYNTH_MAY_IMPORT | own, relative(path)
 
@@ -99,7 +99,7 @@ def test_no_file_is_long(path: Path) -> None:
 
 
 def modules_after(statement: str, *wanted: str) -> set[str]:
-    """Which of the wanted packages a fresh interpreter has loaded after a statement."""
+    """The packages, of those wanted, that a fresh interpreter has loaded after a statement."""
     code = (
         f"import json, sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\n"
         f"print('\\n' + json.dumps([m for m in {list(wanted)!r} if m in sys.modules]))"
@@ -111,7 +111,7 @@ def modules_after(statement: str, *wanted: str) -> set[str]:
 
 HEAVY = ("torch", "monai", "lightning", "torchio", "matplotlib", "SimpleITK")
 FOR_SOME = ("numba", "scipy", "pydicom")
-"""Packages that only some runs need; nibabel imports pydicom where it is installed."""
+"""Packages that only some runs need; nibabel imports pydicom if it is installed."""
 
 
 def test_import_g3r_is_light() -> None:
@@ -177,7 +177,7 @@ def repository_texts() -> list[Path]:
             check=True,
             cwd=REPOSITORY,
         ).stdout.splitlines()
-    except (OSError, subprocess.CalledProcessError):  # an unpacked archive
+    except (OSError, subprocess.CalledProcessError):  # not a git repository, such as an unpacked archive
         listed = [
             relative(path)
             for path in REPOSITORY.rglob("*")
@@ -191,7 +191,7 @@ def repository_texts() -> list[Path]:
 
 
 def test_no_path_of_one_machine() -> None:
-    # spelled in pieces, so that this file does not find itself
+    # written in pieces, so that the search does not find this file
     machine = re.compile("|".join(re.escape(a + b) for a, b in [("/wo", "rk/"), ("/ho", "me/"), ("/ro", "ot/")]))
     shared = ".." + "/shared"
     for path in repository_texts():
@@ -203,6 +203,6 @@ def test_no_path_of_one_machine() -> None:
 @pytest.mark.parametrize("path", SOURCES, ids=relative)
 def test_source_has_a_name_and_a_docstring(path: Path) -> None:
     assert path.stem not in {"utils", "util", "helpers", "misc"}, "a function without a home: name the concept"
-    if not path.is_relative_to(REPOSITORY / "tests"):  # a test's name says what it is about
+    if not path.is_relative_to(REPOSITORY / "tests"):  # the name of a test describes it
         docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
         assert docstring, f"{relative(path)} has no module docstring"

@@ -1,7 +1,7 @@
-"""The recipes of the containers: what they say, and what their install steps make in a clean environment.
+"""The container recipes: their directives, and their install steps in a clean environment.
 
-No engine builds them here. The slow test runs the same commands of pip, then the entry point below a root that is
-read-only, without a home, as `docker run --read-only` does.
+No container engine is used. The slow test runs the same pip commands, then the entry point with a read-only root and
+without a home, like `docker run --read-only`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ exec "$@"
 
 
 def copied() -> list[str]:
-    """What COPY takes from the repository."""
+    """Paths that COPY takes from the repository."""
     texts = [one.text for one in directives() if one.word == "COPY" and not one.text.startswith("--from")]
     return [name for text in texts for name in text.split()[:-1]]
 
@@ -76,7 +76,7 @@ def test_the_recipe_of_apptainer_is_kept_like_the_dockerfile() -> None:
 
 
 def test_the_documented_commands_make_the_output_folder_first() -> None:
-    """Docker would make it as root's, Apptainer refuses to bind what is not there."""
+    """Docker would create the folder as root, and Apptainer refuses to bind a missing folder."""
     text = (REPOSITORY / "docs" / "cohort.md").read_text(encoding="utf-8")
     runs = ["\n".join(lines) for _, lines in blocks(text) if re.search(r"out:/out\b", "\n".join(lines))]
     assert len(runs) == 2
@@ -94,7 +94,7 @@ def test_both_pass_their_checkers() -> None:
 
 
 def installed(root: Path) -> Path:
-    """An environment made by the install steps, in place of the image; returns its folder of programs."""
+    """Folder of programs of an environment made by the install steps, in place of the image."""
     for name in (*copied(), "wheels", "constraints.txt"):
         source, target = REPOSITORY / name, root / "src" / name
         if source.is_dir():
@@ -118,7 +118,7 @@ def installed(root: Path) -> Path:
 
 @pytest.mark.slow
 def test_the_installed_app_needs_nothing_but_its_volumes(subject: Path, tmp_path: Path) -> None:
-    """`docker run --read-only --tmpfs /tmp -v kernels:/cache -v in:/bids:ro -v out:/out`, without Docker."""
+    """Like `docker run --read-only --tmpfs /tmp -v kernels:/cache -v in:/bids:ro -v out:/out`, without Docker."""
     unshare = ["unshare", *([] if os.geteuid() == 0 else ["--map-root-user"]), "--mount"]
     probe = [*unshare, "sh", "-c", "mount -o remount,bind,ro /"]
     if sys.platform != "linux" or subprocess.run(probe, capture_output=True, check=False).returncode:

@@ -1,4 +1,4 @@
-"""Every command of README.md and docs/ is understood; those that reconstruct are tried with stand-ins for the files."""
+"""Every command in README.md and docs/ parses; reconstructions are tried with stand-ins for the files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ STAND_INS = {
     *(f"case/{name}-{n}.nii.gz" for name in ("stack", "mask") for n in range(3)),
     *(f"{network}.safetensors" for network in NETWORKS),
 }
-"""Files that `folder` holds."""
+"""Files in `folder`."""
 
 
 def name_of(one: Shown) -> str:
@@ -45,7 +45,7 @@ def name_of(one: Shown) -> str:
 
 @pytest.fixture(scope="module")
 def folder(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stand-ins: small stacks that show nothing but brain, masks, the same as DICOM, slices with poses, weights."""
+    """Stand-ins: small brain-extracted stacks, masks, the same as DICOM, slices with poses, weights."""
     from tests.dicom.dicom_files import Study
     from tests.reuse.slice_writer import write_three
 
@@ -69,7 +69,7 @@ def folder(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def inputs(words: list[str]) -> list[str]:
-    """Words of a line of `g3r-infer` that are to be files."""
+    """Words of a line of `g3r-infer` that name input files."""
     ends = (".nii.gz", ".safetensors")
     beside = [words[words.index(option) + 1] for option in ("--dicom", "--slices", "--config") if option in words]
     return [word for word in words if word.endswith(ends)] + beside
@@ -86,7 +86,7 @@ RECONSTRUCTIONS = [
 
 
 FRESH_BYTES = 400_000_000
-"""What g3r-infer holds when it plans its memory, torch included."""
+"""Memory of g3r-infer, including torch, when it plans its memory."""
 
 
 @pytest.mark.parametrize("one", SHOWN, ids=name_of)
@@ -115,14 +115,14 @@ def test_a_command_is_understood(one: Shown, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_reconstruction_could_begin(
     one: Shown, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The line with --dry-run: files are read, masks found, weights loaded, memory planned."""
+    """With --dry-run the line reads files, finds masks, loads weights and plans memory."""
     words = one.words
     for path in folder.iterdir():
         (tmp_path / path.name).symlink_to(path)
     for option in {"--output", "--dicom-out"} & set(words):
         (tmp_path / words[words.index(option) + 1]).unlink(missing_ok=True)
     monkeypatch.chdir(tmp_path)
-    # as a command finds itself; this process holds what other tests have left behind
+    # as in a fresh command, since this process holds leftovers of other tests
     monkeypatch.setattr("g3r.planning.memory_estimate.held_bytes", lambda: FRESH_BYTES)
     dry = [] if "--dry-run" in words else ["--dry-run"]
     assert main_of("g3r-infer")([*words[1:], *dry]) == 0, capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What the documents point at exists: links, anchors, files, and the names of functions in them."""
+"""References in the documents exist: links, anchors, files, and functions in them."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def name_of(path: Path) -> str:
 
 
 def file_of(text: str) -> Path | None:
-    """The file or folder that a path in a document means: of the repository, or of g3r."""
+    """The file or folder of a path in a document, relative to the repository or to g3r."""
     return next((path for path in (REPOSITORY / text, REPOSITORY / "g3r" / text) if path.exists()), None)
 
 
 def anchors(path: Path) -> set[str]:
-    """Names of a document's headings, as links write them."""
+    """Anchors of a document's headings, as used in links."""
     titles = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
@@ -55,7 +55,7 @@ def test_files_that_are_named_exist(path: Path) -> None:
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
 def test_functions_that_are_named_exist(path: Path) -> None:
-    """Written as `room/module.py`: `name` or `Class.name`."""
+    """References have the form `room/module.py`: `name` or `Class.name`."""
     for text, names in re.findall(r"`([\w/]+\.py)`: ((?:`[\w.]+`(?:, )?)+)", path.read_text(encoding="utf-8")):
         file = file_of(text)
         assert file, f"{name_of(path)}: {text}"
@@ -76,7 +76,7 @@ def test_functions_that_are_named_exist(path: Path) -> None:
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
 def test_lines_are_short(path: Path) -> None:
-    """Tables, and what commands write between markers, apart."""
+    """Tables, and text that commands write between markers, are exempt."""
     text = re.sub(r"<!-- ([\w.-]+):begin -->.*?<!-- \1:end -->", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
     long = [line for line in text.splitlines() if len(line) > MAX_CHARACTERS and not line.startswith("|")]
     assert not long, f"{name_of(path)}: {long[0]}"

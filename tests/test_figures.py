@@ -1,4 +1,4 @@
-"""Figures that stand in several documents are the same in all of them, and follow from what was measured."""
+"""Figures that appear in several documents agree, and follow from the measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The notebook runs from its first to its last cell, and is kept without its outputs."""
+"""The notebook runs from first to last cell, and is stored without outputs."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def test_outputs_are_left_out() -> None:
     assert not any(cell["outputs"] or cell["execution_count"] for cell in cells)
 
 
-def test_it_runs(tmp_path: Path) -> None:
-    """In a process of its own: Jupyter's warnings are none of ours."""
+def test_all_cells_run_and_show_the_report_with_three_pictures(tmp_path: Path) -> None:
+    """It runs in a separate process, because Jupyter's warnings must not fail this test."""
     done = tmp_path / "done.ipynb"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "MPLBACKEND": "agg"}
     line = [sys.executable, "-c", RUN, str(NOTEBOOK), str(done)]

@@ -1,4 +1,4 @@
-"""The packages that users install: built from the source distribution, installed into an environment of their own."""
+"""The packages that users install: built from the source distribution, installed into a clean environment."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run(*line: str | Path, cwd: Path) -> str:
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel that was built from a source distribution, in a copy of the sources."""
+    """A wheel built from a source distribution, in a copy of the sources."""
     pytest.importorskip("build", reason="the dev extra is not installed")
     sources = tmp_path_factory.mktemp("sources")
     for name in BUILT_FROM:
@@ -60,7 +60,7 @@ def test_a_wheel_from_the_source_distribution_works_in_a_clean_environment(dist:
         wheel,
         cwd=tmp_path,
     )
-    # the libraries that it needs come from this environment; they stand behind its own packages
+    # required libraries come from this environment, after the packages of the clean one
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     where = run(scripts / "python", "-c", "import g3r, data_synth; print(g3r.__file__)", cwd=tmp_path).strip()
     assert Path(where).is_relative_to(tmp_path)

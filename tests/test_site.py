@@ -1,4 +1,4 @@
-"""The site of docs/ builds without a warning, and its pages ask nothing of another server."""
+"""The site of docs/ builds without warnings, and its pages need no other server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CONFIG = REPOSITORY / "mkdocs.yml"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built site; pages that are in no menu, and links that lead nowhere, are warnings, and end the build."""
+    """The built site; pages missing in the menu and broken links are warnings, which fail the build."""
     folder = tmp_path_factory.mktemp("site")
     line = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--config-file", str(CONFIG)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
@@ -45,7 +45,7 @@ def test_no_page_needs_another_server(site: Path) -> None:
 
 
 def test_links_within_the_site_lead_somewhere(site: Path) -> None:
-    """Those of raw HTML and of the pages from outside of docs/, too."""
+    """This includes links in raw HTML and in pages from outside docs/."""
     for page in site.glob("*.html"):
         for link in re.findall(r'<a[^>]* href="([^"#]+)', page.read_text(encoding="utf-8")):
             if page.name != "404.html" and not link.startswith(("http", "mailto:")):
@@ -61,7 +61,7 @@ def test_equations_are_written_out(site: Path) -> None:
 
 
 def test_nothing_is_left_of_the_markup(site: Path) -> None:
-    """Lists and tables that begin without an empty line, and signs that were taken for tags."""
+    """Leftovers come from lists and tables without an empty line before them, and from signs taken for tags."""
     for page in site.glob("*.html"):
         text = page.read_text(encoding="utf-8")
         text = re.sub(r"<(pre|code|math|script)\b.*?</\1>", "", text, flags=re.DOTALL)
@@ -89,6 +89,6 @@ def test_the_menu_has_the_parts() -> None:
 
 
 def test_the_questions_are_sixteen() -> None:
-    """The sixteen needs that users of such programs have, and what to do if none of them is yours."""
+    """The page has sixteen needs of users, and one heading for all other needs."""
     text = (REPOSITORY / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     assert len(re.findall(r"^## ", text, flags=re.MULTILINE)) == 16 + 1

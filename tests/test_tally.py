@@ -1,4 +1,4 @@
-"""The table of counts itself: what is lost is seen."""
+"""The table of counts reports lost cases."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a cohort costs: docs/cohort.md."""
+"""Cost of a cohort: docs/cohort.md."""

@@ -1,4 +1,4 @@
-"""`python -m studies.cohort.cost`: one subject by g3r-bids, and the page of a thousand."""
+"""`python -m studies.cohort.cost`: time, memory and files of one subject of g3r-bids, and of a page of a thousand."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from studies.harness import Record, Row, Study, Task, positive
 from studies.tables import table
 
 SUBJECT = ("--phantom", "30", "--resolution", "0.8", "--thickness", "3", "--seed", "61004")
-"""Options of g3r-simulate: three stacks, about a hundred slices, as usual examinations have."""
+"""Options of g3r-simulate for a usual examination: three stacks, about a hundred slices."""
 
 MB = 1e6
 POLL_S = 0.2
 
 
 def add_subject(case: Path, root: Path) -> None:
-    """Put a simulated case into a BIDS data set, masks among the derivatives."""
+    """Add a simulated case to a BIDS data set, with its masks among the derivatives."""
     for kind, folder in (("stack", root), ("mask", root / "derivatives" / "masks")):
         anat = folder / "sub-01" / "anat"
         anat.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def add_subject(case: Path, root: Path) -> None:
 
 
 def subject(folder: Path) -> Row:
-    """One subject from start to end, its process alone on its cores.
+    """Measure one subject of g3r-bids from start to end, with no other process on its cores.
 
     Raises:
         InputError: it was not reconstructed.
@@ -73,7 +73,7 @@ def subject(folder: Path) -> Row:
         "seconds": seconds,
         "cpu_seconds": after.children_user + after.children_system - before.children_user - before.children_system,
         "held_bytes": held_bytes,
-        "n_files": len(kept) + 1,  # and its log
+        "n_files": len(kept) + 1,  # plus the log
         "kept_bytes": sum(kept),
         "work_bytes": work_bytes,
         "thumbnail_bytes": figure_path(_session("01"), out, THUMBNAIL).stat().st_size,
@@ -82,7 +82,7 @@ def subject(folder: Path) -> Row:
 
 
 def page(folder: Path, n: int) -> Row:
-    """Table and page of so many sessions, one in ten with something to look at; its pictures are empty files."""
+    """Measure table and page of `n` sessions, one in ten with a problem; the pictures are empty files."""
     out = folder / "page"
     shutil.rmtree(out, ignore_errors=True)
     verdicts = [FAILED, DO_NOT_USE, CHECK, *[USE] * 27]
@@ -121,7 +121,7 @@ def _outcome(number: int, verdict: str) -> Outcome:
 
 
 def _sizes(folder: Path) -> Iterator[int]:
-    """Bytes of each file below a folder; a file that goes meanwhile is passed by."""
+    """Bytes of each file below a folder; files that disappear meanwhile are skipped."""
     for path in folder.rglob("*") if folder.is_dir() else ():
         with suppress(OSError):
             if path.is_file():
@@ -129,7 +129,7 @@ def _sizes(folder: Path) -> Iterator[int]:
 
 
 def _held_bytes(pid: int) -> int:
-    """Memory of a process and those that it started."""
+    """Resident memory of a process and its children."""
     with suppress(psutil.Error):
         one = psutil.Process(pid)
         return sum(int(process.memory_info().rss) for process in (one, *one.children(recursive=True)))
@@ -137,13 +137,13 @@ def _held_bytes(pid: int) -> int:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """The subject and the page."""
+    """Two tasks: the subject and the page."""
     yield Task("subject", subject, (options.output,))
     yield Task("page", page, (options.output, options.sessions))
 
 
 def tables(record: Record) -> dict[str, str]:
-    """What was measured, and the same times the number of sessions."""
+    """Costs of one session, and of the whole cohort."""
     one, many = record["rows"].get("subject"), record["rows"].get("page")
     if not one or not many:
         return {}

@@ -1,7 +1,7 @@
 """The moving picture of docs/how.md: Gaussians that are fitted to slices: `python -m studies.how.fit`.
 
-The built-in phantom, three stacks with moderate motion. So that there is something to see, the fit starts from the
-seeds: without the prior, without amplitudes by least squares. As shipped it begins close to where this one ends.
+It shows the built-in phantom, from three stacks with moderate motion. To make the progress visible, the fit starts from
+the seeds, without the prior and without amplitudes by least squares. The shipped fit starts close to where this ends.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BRIGHT_PERCENTILE = 99.7
 
 
 class Watcher:
-    """Keeps the cloud at the steps that are shown."""
+    """Observer of the fit that keeps the cloud at the steps that are shown."""
 
     every = 1
 
@@ -48,13 +48,13 @@ class Watcher:
         self.clouds: dict[int, GaussianCloud] = {}
 
     def __call__(self, moment: FitMoment) -> None:
-        """Take a step of the fit to the slices."""
+        """Keep the cloud if this step of the fit to the slices is shown."""
         if moment.slices is not None and moment.step in SHOWN_STEPS:
             self.clouds[moment.step] = moment.cloud()
 
 
 def section(cloud: GaussianCloud, result: ReconstructionResult) -> NDArray[np.float32]:
-    """The middle coronal section [across, up] of a cloud, in pixels of `PIXEL_MM`, where the result shows its own."""
+    """The middle coronal section [across, up] of a cloud, in pixels of `PIXEL_MM`, in the support of the result."""
     grid, center_mm = result.grid, result.grid.world(np.argwhere(result.mask).mean(0))
     first, last = grid.world(np.zeros(3)), grid.world(np.array(grid.shape) - 1.0)
     affine = np.diag([PIXEL_MM, PIXEL_MM, PIXEL_MM, 1.0])
@@ -68,7 +68,7 @@ def section(cloud: GaussianCloud, result: ReconstructionResult) -> NDArray[np.fl
 
 
 def across_slices(stack: Stack) -> NDArray[np.float32]:
-    """A stack cut across its slices [across, up]: what motion between slices does to it."""
+    """A section across the slices of a stack [across, up], which shows the motion between slices."""
     rows = np.flatnonzero(stack.mask.any((0, 2)))
     return stack.image[:, rows[len(rows) // 2], :]
 
@@ -83,7 +83,7 @@ def picture(data: NDArray[np.floating], mm: tuple[float, float]) -> Image.Image:
     bright = np.percentile(data[data > 0], BRIGHT_PERCENTILE)
     grey = np.rint(255 * np.clip(data.T[::-1, ::-1] / bright, 0, 1)).astype(np.uint8)
     extent_mm = data.shape[0] * mm[0], data.shape[1] * mm[1]
-    # slices stay visible as bars: they are what was measured
+    # no smoothing: the measured slices stay visible as bars
     size = (round(HEIGHT * extent_mm[0] / extent_mm[1]), HEIGHT)
     return Image.fromarray(grey).resize(size, Image.Resampling.BOX if mm[1] > 1 else Image.Resampling.BICUBIC)
 

@@ -1,1 +1,1 @@
-"""Whether lesions survive the prior (docs/prior.md)."""
+"""Preservation of lesions by the prior (docs/prior.md)."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from studies.lesions.runs import LesionRun
 
 HALF_WIDTH_MM = {"bright": 20.0, "dark": 20.0, "ventricle": 38.0}
-"""Shown around a lesion's middle."""
+"""Half the width of the section around a lesion's centre."""
 
 PANEL_INCHES = 1.75
 GREY = "#c8c8c8"
@@ -25,12 +25,12 @@ TRUTH = "truth"
 
 
 def save_sections(run: LesionRun, path: Path) -> None:
-    """Keep what the figure shows of a run: sections and shares by kind and volume, and the white point."""
+    """Save the data of the figure of a run: sections and shares by kind and volume, and the white point."""
     subject = run.subject
     truth = with_lesions(subject.healthy, subject.lesions).data
     kept: dict[str, Any] = {"white": np.percentile(truth[subject.healthy.mask], 99.7)}
     for kind, half_mm in HALF_WIDTH_MM.items():
-        # of several spheres the first: no choice by how well it came out
+        # always the first of several spheres, not the best one
         number = next(k for k, lesion in enumerate(subject.lesions) if lesion.kind == kind)
         for name, volume in {TRUTH: truth, **run.volumes}.items():
             center_mm = subject.lesions[number].center_mm
@@ -45,9 +45,9 @@ def draw_lesions_kept(subject: str, sections: Mapping[int, Path], variants: Sequ
 
     Args:
         subject: name of the head.
-        sections: by number of stacks, files of `save_sections`.
+        sections: files of `save_sections`, by number of stacks.
         variants: rows below the truth.
-        path: PNG to write, whole or not at all.
+        path: PNG to write, atomically.
     """
     names = (TRUTH, *variants)
     n_columns = len(sections) * len(HALF_WIDTH_MM)
@@ -78,7 +78,7 @@ def draw_lesions_kept(subject: str, sections: Mapping[int, Path], variants: Sequ
 def _section(
     volume: NDArray[np.float32], grid: VolumeGrid, center_mm: NDArray[np.float64], half_mm: float
 ) -> NDArray[np.float32]:
-    """The axial section [x, y] around a point, padded with zeros where the volume ends."""
+    """The axial section [x, y] around a point, padded with zeros beyond the volume."""
     center = np.round(grid.index(center_mm)).astype(int)
     reach = np.ceil(half_mm / grid.spacing_mm).astype(int)
     plane = np.pad(volume[:, :, center[2]], ((reach[0], reach[0]), (reach[1], reach[1])))

@@ -1,4 +1,4 @@
-"""`python -m studies.lesions.kept`: does a lesion that slices cover survive the prior?"""
+"""`python -m studies.lesions.kept`: how much of a lesion that slices cover is kept with the prior."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from studies.subjects import data_folder
 from studies.tables import details, spread, stacks, table
 
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
-"""Weeks that no training and no choice has seen."""
+"""Weeks that were used for no training and no choice of settings."""
 
 DEVELOPMENT_VOLUMES = ("spina-bifida/sb26-operated", "spina-bifida/sb30-operated", "spina-bifida/sb33-operated")
 
@@ -27,7 +27,7 @@ FIRST_SEED, DEVELOPMENT_SEED = 52_300, 51_300
 
 STACK_NUMBERS = (3, 1)
 WANTED_SHARE = 0.85
-"""Smallest accepted share, with the prior, of what the fit without prior keeps."""
+"""Smallest accepted ratio of the contrast kept with the prior to the contrast kept without it."""
 
 WITH_PRIOR, WITHOUT_PRIOR, PRIOR_ALONE = "with prior", "without prior", "prior alone"
 VARIANTS = (WITHOUT_PRIOR, WITH_PRIOR, PRIOR_ALONE)
@@ -35,7 +35,7 @@ KINDS = {"bright": "bright sphere, 6 mm", "dark": "dark sphere, 6 mm", "ventricl
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every head from every number of stacks; of the first, sections are kept for the figure."""
+    """One task per head and number of stacks; sections of the first head are saved for the figure."""
     volumes = DEVELOPMENT_VOLUMES if options.development else VOLUMES
     first_seed = DEVELOPMENT_SEED if options.development else FIRST_SEED
     for n in range(options.subjects):
@@ -49,7 +49,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 @functools.lru_cache(maxsize=1)
 def sliced(volume: str, seed: int) -> LesionSubject:
-    """A head with its lesions, once for all numbers of stacks."""
+    """A head with its lesions, sliced once for all numbers of stacks."""
     return lesion_subject(volume, seed, data_folder("atlas"))
 
 
@@ -63,7 +63,7 @@ def measure(subject: tuple[str, int], n_stacks: int, sections: Path | None, opti
         options: of the command.
     """
     settings = PRESETS[options.preset]
-    # at the true poses no slice may move, or the two reconstructions of a pair would differ by that too
+    # slices stay at their true poses, otherwise the two reconstructions of a pair would also differ by motion
     settings = replace(
         settings,
         registration=replace(settings.registration, segments=False),
@@ -80,14 +80,14 @@ def measure(subject: tuple[str, int], n_stacks: int, sections: Path | None, opti
 
 
 def line(key: str, row: Row) -> str:
-    """Shares kept, lesion by lesion."""
+    """Progress line with the share kept of each lesion."""
     form = "{kind} " + "/".join(f"{{kept[{name}]:.2f}}" for name in VARIANTS)
     shares = ", ".join(form.format_map(one) for one in row["lesions"])
     return f"{key}: {'/'.join(VARIANTS)}: {shares}, {row['seconds']:.0f} s"
 
 
 def tables(record: Record) -> dict[str, str]:
-    """By kind and number of stacks, then every lesion."""
+    """Shares kept by kind and number of stacks, then for every lesion."""
     lesions = [one for row in record["rows"].values() for one in row["lesions"]]
     summary = []
     for n in sorted({one["n_stacks"] for one in lesions}, reverse=True):
@@ -122,7 +122,7 @@ def tables(record: Record) -> dict[str, str]:
 
 
 def draw(record: Record, options: argparse.Namespace) -> None:
-    """Sections of the first head, of every number of stacks that was measured."""
+    """Draw sections of the first head for every number of stacks that was measured."""
     rows = list(record["rows"].values())
     name = rows[0]["lesions"][0]["subject"]
     first = [row for row in rows if row["lesions"][0]["subject"] == name]

@@ -1,4 +1,4 @@
-"""One head with and without its lesions, sliced alike and reconstructed: how much of each lesion is kept."""
+"""Reconstruction of one head with and without its lesions, from the same slices, and the share kept of each lesion."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from studies.subjects import BRIGHT, SubjectSpec, stretched
 MARGIN_VOXELS = 4
 MOTION = "mild"
 DROPOUT_WEIGHT = 0.05
-"""Trust in a slice that lost its signal, as registration would have it."""
+"""Weight of a slice that lost its signal, as registration would give it."""
 
 
 @dataclass(frozen=True)
 class LesionSubject:
-    """A head, its lesions, and the same three stacks of both: motion, gains and noise do not differ."""
+    """A head, its lesions, and three stacks with and without them, with the same motion, gains and noise."""
 
     name: str
     healthy: TruthVolume
@@ -51,7 +51,7 @@ class LesionRun:
 
     Attributes:
         subject: the head.
-        n_stacks: how many of its stacks were used.
+        n_stacks: number of its stacks that were used.
         volumes: variant -> reconstruction with lesions [I, J, K], on the truth's grid and in its intensities.
         kept: variant -> share of the contrast of each lesion that is kept.
         seconds: of all reconstructions.
@@ -77,12 +77,12 @@ class LesionRun:
 
 
 def lesion_subject(volume: str, seed: int, atlas: Path) -> LesionSubject:
-    """A head of the atlas, stretched, with lesions at places that the seed decides; sliced with and without.
+    """A stretched head of the atlas with random lesions, sliced with and without them.
 
     Args:
-        volume: of the atlas.
+        volume: name of the atlas subject.
         seed: of stretch, lesions and slices.
-        atlas: its folder.
+        atlas: folder of the atlas.
 
     Raises:
         InputError: the atlas lacks the volume or its label map.
@@ -110,17 +110,16 @@ def lesion_subject(volume: str, seed: int, atlas: Path) -> LesionSubject:
 def lesion_run(
     subject: LesionSubject, n_stacks: int, reconstructors: Mapping[str, GaussianReconstructor], prior_alone: str
 ) -> LesionRun:
-    """Reconstruct a head twice by each variant and compare the difference with the lesions.
+    """Reconstruct a head with and without lesions by each variant, and compare the difference with the lesions.
 
-    Poses and gains of the slices are the true ones. A wrong pose blurs a lesion with and without prior alike;
-    here the question is what the prior does to what slices show, and both reconstructions have to be in
-    one frame.
+    Poses and gains of the slices are the true ones. A wrong pose blurs a lesion with and without the prior alike,
+    whereas this study measures the effect of the prior alone. Both reconstructions must also be in one frame.
 
     Args:
         subject: the head.
-        n_stacks: its first stacks.
-        reconstructors: variant -> how; the last one's prior volume is a variant of its own.
-        prior_alone: name of that.
+        n_stacks: number of its first stacks to use.
+        reconstructors: variant -> reconstructor; the prior volume of the last one is an additional variant.
+        prior_alone: name of that additional variant.
     """
     start = time.perf_counter()
     found: dict[str, dict[str, ReconstructionResult]] = {}
@@ -136,7 +135,7 @@ def lesion_run(
     volumes, shares = {}, {}
     for variant, pair in pairs.items():
         inside = subject.healthy.mask & (pair["healthy"] != 0)
-        # slices carry gains of their own: one factor brings the pair into the truth's intensities
+        # slices have random gains: one factor brings both volumes of the pair to the truth's intensities
         scale = np.float32(subject.healthy.data[inside].mean() / pair["healthy"][inside].mean())
         volumes[variant] = pair["lesions"] * scale
         change = (pair["lesions"] - pair["healthy"]) * scale
@@ -170,5 +169,5 @@ def true_motion(stacks: list[SimulatedStack]) -> Registration:
 
 
 def _on_truth(data: NDArray[np.float32], grid: VolumeGrid, subject: LesionSubject) -> NDArray[np.float32]:
-    """A volume on the truth's grid: true poses leave both in one frame."""
+    """A volume on the truth's grid; with true poses both are in one frame."""
     return resample(Volume(data, grid.affine, subject.name), subject.grid)

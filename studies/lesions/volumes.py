@@ -1,4 +1,4 @@
-"""Synthetic lesions in an atlas volume (spheres, an enlarged ventricle), and how much of them is kept."""
+"""Synthetic lesions in an atlas volume (spheres, an enlarged ventricle), and the share of them that is kept."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ BRIGHT_LEVEL, DARK_LEVEL = 1.0, 0.15
 """Intensity of the spheres; 1 is the 99.5th percentile in the mask, about that of fluid."""
 
 MIN_CONTRAST = 0.35
-"""Between a sphere and the tissue that it replaces (mean of it), in the same unit."""
+"""Least difference between a sphere and the mean of the tissue that it replaces, in the same unit."""
 
 MIN_DEPTH_MM = 7.0
-"""Least depth of a sphere's centre below the rim of the mask: it and some tissue around it are all brain."""
+"""Least depth of a sphere's centre below the rim of the mask, so that the sphere and its surroundings are brain."""
 
 APART_MM = 16.0
-"""Between the middles of two spheres, and of a sphere and the changed ventricle."""
+"""Least distance between the centres of two spheres, and of a sphere and the changed ventricle."""
 
 VENTRICLE_LABEL = 2
-"""Lateral ventricles in the atlases' label maps (bright; their volume is what ventriculomegaly enlarges)."""
+"""Label of the lateral ventricles in the atlases' label maps (bright; ventriculomegaly enlarges them)."""
 
 VENTRICLE_GROWTH_MM = 4.0
-"""How far the wall of one lateral ventricle is moved outwards: 4 mm on each side takes it from under 10 mm,
-which is normal, beyond 15 mm, which is called severe."""
+"""Outward shift of the wall of one lateral ventricle: 4 mm on each side widens it from under 10 mm (normal) to over
+15 mm (severe)."""
 
 AROUND_MM = 4.0
-"""How far around a lesion it is looked for: blur spreads it."""
+"""Margin around a lesion that is evaluated with it, because blur spreads the lesion."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Lesion:
 
     Args:
         kind: bright, dark or ventricle.
-        change: [I, J, K] what it adds to the healthy volume.
+        change: [I, J, K] difference to the healthy volume.
         where: [I, J, K] bool, the changed voxels and their surroundings.
-        center_mm: its middle, in the world of the volume.
+        center_mm: its centre, in the world of the volume.
     """
 
     kind: str
@@ -60,9 +60,8 @@ class Lesion:
 def kept(change_found: NDArray[np.floating], lesion: Lesion) -> float:
     """Share of a lesion's contrast that a reconstruction keeps.
 
-    The factor that brings the true change nearest to what changed in the reconstruction, both less their
-    mean over the lesion and its surroundings: 1 for the truth, 0 for a reconstruction that does not show the
-    lesion.
+    It is the least-squares factor of the true change in the change of the reconstruction, after subtraction of their
+    means over the lesion and its surroundings: 1 for the truth, 0 for a reconstruction that does not show the lesion.
 
     Args:
         change_found: [I, J, K] reconstruction with the lesion minus the one without, on the lesion's grid.
@@ -100,14 +99,14 @@ def load_labels(volume_file: Path, mask_file: Path, margin_voxels: int) -> Truth
 def draw_lesions(
     truth: TruthVolume, labels: NDArray[np.floating], bright: float, rng: np.random.Generator, n_of_each: int = 2
 ) -> list[Lesion]:
-    """An enlarged ventricle, and spheres at random places of a head.
+    """Random lesions of a head: an enlarged ventricle and spheres.
 
     Args:
         truth: the healthy head.
         labels: [I, J, K] on its grid.
         bright: the intensity that counts as 1.
-        rng: chooses the side of the ventricle and the places.
-        n_of_each: bright spheres, and as many dark ones.
+        rng: draws the side of the ventricle and the positions.
+        n_of_each: number of bright spheres, and of dark spheres.
 
     Raises:
         InputError: the head has no room for them.
@@ -120,7 +119,7 @@ def draw_lesions(
     free &= distance_transform_edt(lesions[0].change == 0, sampling=spacing) > APART_MM / 2
     width = np.maximum(np.round(DIAMETER_MM / spacing).astype(int), 1)
     mean = uniform_filter(truth.data / np.float32(bright), width.tolist())
-    # bright spheres first: dark tissue deep in the head is rarer than bright
+    # bright spheres first, because they need dark tissue, which is rarer deep in the head than bright tissue
     for kind, level in (("bright", BRIGHT_LEVEL), ("dark", DARK_LEVEL)):
         for _ in range(n_of_each):
             contrast = (level - mean) if kind == "bright" else (mean - level)
@@ -136,12 +135,12 @@ def draw_lesions(
 
 
 def with_lesions(truth: TruthVolume, lesions: Sequence[Lesion]) -> TruthVolume:
-    """The head with its lesions; they are apart, so that their changes add up."""
+    """The head with its lesions, which do not overlap, so that their changes add up."""
     return replace(truth, data=truth.data + sum((one.change for one in lesions), np.zeros((), np.float32)))
 
 
 def _sphere(truth: TruthVolume, grid: VolumeGrid, center_mm: NDArray[np.float64], kind: str, level: float) -> Lesion:
-    """A ball of one intensity, its surface softened over a voxel (partial volume)."""
+    """A sphere of uniform intensity with a surface softened over one voxel (partial volume)."""
     distance = np.linalg.norm(_positions(grid) - center_mm, axis=-1)
     covered = np.clip((DIAMETER_MM / 2 - distance) / grid.spacing_mm.mean() + 0.5, 0, 1)
     change = (covered * (level - truth.data)).astype(np.float32)
@@ -149,7 +148,7 @@ def _sphere(truth: TruthVolume, grid: VolumeGrid, center_mm: NDArray[np.float64]
 
 
 def _ventricle(truth: TruthVolume, labels: NDArray[np.floating], grid: VolumeGrid, rng: np.random.Generator) -> Lesion:
-    """One lateral ventricle with its wall moved outwards, filled with its own fluid."""
+    """One lateral ventricle, enlarged by an outward shift of its wall and filled with its own fluid intensity."""
     both = labels == VENTRICLE_LABEL
     if not both.any():
         raise InputError(f"{truth.name}: the label map has no ventricle (label {VENTRICLE_LABEL})")
@@ -158,7 +157,7 @@ def _ventricle(truth: TruthVolume, labels: NDArray[np.floating], grid: VolumeGri
     fluid = both & ((across if rng.integers(2) else -across) > 0)
     beyond = distance_transform_edt(~fluid, sampling=grid.spacing_mm)
     grown = np.clip((VENTRICLE_GROWTH_MM - beyond) / grid.spacing_mm.mean() + 0.5, 0, 1)
-    # fluid does not reach the rim of the head, nor across the middle
+    # the fluid must reach neither the rim of the head nor across the midline
     inner = distance_transform_edt(truth.mask, sampling=grid.spacing_mm)
     grown = np.where(inner > MIN_DEPTH_MM / 2, grown, 0)
     core = fluid & (distance_transform_edt(fluid, sampling=grid.spacing_mm) > grid.spacing_mm.mean())

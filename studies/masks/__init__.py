@@ -1,1 +1,1 @@
-"""What docs/masks.md shows: how good the automatic brain masks are."""
+"""Quality of the automatic brain masks: the tables of docs/masks.md."""

@@ -1,8 +1,8 @@
 """`python -m studies.masks.cases`: volumes from stacks in surroundings, with true and with automatic masks.
 
-The truth is black from the edge of the brain on, the scene is not. So a volume is wrong at the edge wherever its masks
-reach beyond it, as masks that people draw do: true masks with such a rim tell this apart from faults of found masks,
-and a second score leaves the edge out.
+The truth is black beyond the edge of the brain, but the scene is not. A volume is therefore wrong at the edge wherever
+its masks reach beyond the brain, as hand-drawn masks do. To separate this effect from errors of found masks, true masks
+with such a rim are measured too, and a second score leaves the edge out.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from studies.tables import Cell, table
 
 SEED = 81_000
 EDGE_MM = 2.0
-"""Depth below which voxels do not count in the second score."""
+"""Voxels less deep in the brain than this do not count in the second score."""
 
 
 WAYS = ("true", "drawn", "found")
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Both ways, case by case."""
+    """One task per case, which measures all ways."""
     folders = options.folders or sorted(path for path in data_folder("cases").iterdir() if path.is_dir())
     for n, folder in enumerate(folders):
         yield Task(folder.name, measure, (folder, SEED + n, options))
 
 
 def measure(folder: Path, seed: int, options: argparse.Namespace) -> Row:
-    """The volume with true masks, and with those that are found.
+    """Scores of one case with true masks, with true masks and a rim, and with found masks.
 
     Args:
         folder: of the case.
@@ -70,7 +70,7 @@ def measure(folder: Path, seed: int, options: argparse.Namespace) -> Row:
 
 
 def _dice(found: Stack | None, true: Stack) -> float:
-    """Overlap with the true mask as people would draw it."""
+    """Dice coefficient of a found mask and the true mask with the rim of hand-drawn masks."""
     if found is None:
         return 0.0
     drawn = as_people_draw(true.mask, true.spacing_mm)
@@ -79,7 +79,7 @@ def _dice(found: Stack | None, true: Stack) -> float:
 
 
 def _masked(stack: Stack, source: str | None) -> Stack | None:
-    """The stack with the mask that is found; None where no head is."""
+    """The stack with the mask that the network finds; None if it finds no head."""
     from g3r.mask_network.inference import find_brain
 
     found = find_brain(stack.image, stack.spacing_mm.tolist(), mask_model(source))
@@ -93,7 +93,7 @@ def _scores(case: SimulatedCase, reconstructor: GaussianReconstructor, stacks: S
     depth_mm = distance_transform_edt(case.truth_mask, sampling=case.truth.grid.spacing_mm)
     volume = Volume(result.volume, result.grid.moved(error.common).affine, case.name)
     inside = compare(volume, case.truth, depth_mm > EDGE_MM, align=True)
-    whole = score(inside.volume, case.truth.data, case.truth_mask)  # the edge must not turn the head
+    whole = score(inside.volume, case.truth.data, case.truth_mask)  # aligned without the edge, so it cannot rotate it
     return {
         "psnr_db": round(whole.psnr_db, 3),
         "inner_psnr_db": round(inside.scores.psnr_db, 3),
@@ -102,7 +102,7 @@ def _scores(case: SimulatedCase, reconstructor: GaussianReconstructor, stacks: S
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case."""
+    """Progress line of a finished case."""
     return (
         f"{key}: Dice {mean(row['dice']):.3f}, true masks {row['true_psnr_db']:.2f} dB, "
         f"found masks {row.get('found_psnr_db', float('nan')):.2f} dB"

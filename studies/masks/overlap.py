@@ -1,4 +1,4 @@
-"""What is measured of a brain mask that was found automatically, and the options of both studies of them."""
+"""Measures of an automatic brain mask against the true mask, and common options of the mask studies."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--masks": {"metavar": "MASK.safetensors", "help": "mask networks (None: those shipped)"}
 }
 LOST_PIXELS = 50
-"""A slice with more pixels of brain than these, of which none was found, is lost."""
+"""A slice is lost if it has more brain pixels than this and none of them was found."""
 
 
 def settings(options: argparse.Namespace) -> Record:
-    """Which weights rows were made with.
+    """The weights that rows were measured with.
 
     Raises:
         InputError: no such file.
@@ -41,7 +41,7 @@ def settings(options: argparse.Namespace) -> Record:
 
 @cache
 def mask_model(source: str | None) -> MaskModel:
-    """The mask networks of a file, read once."""
+    """The mask network of a file, read once."""
     from g3r.mask_network.model import MaskModel
 
     return MaskModel.load(source)
@@ -52,9 +52,9 @@ def scored(image: NDArray[np.float32], true: NDArray[np.bool_], spacing_mm: Sequ
 
     Args:
         image: [I, J, K].
-        true: [I, J, K]; empty where the stack shows no head.
+        true: [I, J, K]; empty if the stack shows no head.
         spacing_mm: [3].
-        source: of the mask networks.
+        source: file of the mask network.
     """
     from g3r.mask_network.inference import find_brain
 
@@ -95,7 +95,7 @@ def overlap(found: NDArray[np.bool_], true: NDArray[np.bool_], spacing_mm: Seque
 
 
 def line(key: str, row: Row) -> str:
-    """A finished stack."""
+    """Progress line of a finished stack."""
     if not row["head"]:
         return f"{key}: no head, {'one found' if row['found'] else 'none found'}, {row['seconds']:.1f} s"
     off = "-" if row["centre_mm"] is None else f"{row['centre_mm']:.1f} mm"

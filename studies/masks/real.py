@@ -1,8 +1,8 @@
 """`python -m studies.masks.real`: brain masks found in real stacks, compared with masks drawn by hand.
 
-The network sees one stack. What `g3r-infer --masks auto` writes was compared between stacks, too: the subjects with
-three stacks or more are reconstructed once with masks that are found, and once without each stack, which the volume
-then predicts, as it does when made with the masks drawn by hand.
+The network sees one stack at a time, whereas the masks that `g3r-infer --masks auto` writes are also compared between
+stacks. Subjects with at least three stacks are therefore reconstructed with found masks, and then without each stack,
+with found and with hand-drawn masks, to compare how well the volumes predict the stack that was left out.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from studies.tables import Cell, table
 MASK_ENDING = "_desc-brain_mask.nii.gz"
 
 ERODED_PIXELS = 4
-"""Rim of a drawn mask that does not count when its stack is predicted."""
+"""Width of the rim of a drawn mask that does not count when its stack is predicted."""
 
 
 def stacks_with_masks() -> list[tuple[Path, Path]]:
-    """Stacks of `real/` in the test data with the masks drawn on them.
+    """Files of the stacks of `real/` in the test data with their hand-drawn masks.
 
     Raises:
         InputError: there is none.
@@ -49,7 +49,7 @@ def stacks_with_masks() -> list[tuple[Path, Path]]:
 
 
 def subjects_with_masks() -> dict[str, list[tuple[Path, Path]]]:
-    """The same by subject, of those with three stacks or more."""
+    """Files of stacks and hand-drawn masks by subject, for subjects with at least three stacks."""
     subjects: dict[str, list[tuple[Path, Path]]] = {}
     for stack, mask in stacks_with_masks():
         subjects.setdefault(stack.name.split("_")[0], []).append((stack, mask))
@@ -57,7 +57,7 @@ def subjects_with_masks() -> dict[str, list[tuple[Path, Path]]]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per stack, one per subject, and one per stack that is left out."""
+    """One task per stack, one per subject, and one per stack that is left out."""
     for stack, mask in stacks_with_masks():
         yield Task(_name(stack), measure, (stack, mask, options))
     for name, pairs in subjects_with_masks().items():
@@ -71,22 +71,22 @@ def _name(stack: Path) -> str:
 
 
 def measure(stack: Path, mask: Path, options: argparse.Namespace) -> Row:
-    """One stack.
+    """Overlap of the mask that the network finds in one stack with the hand-drawn mask.
 
     Args:
         stack: its file.
-        mask: file of the mask drawn by hand.
+        mask: file of the hand-drawn mask.
         options: of the command.
     """
-    true = load_stack(stack, mask)  # rows in the order in which the product asks the network, too
+    true = load_stack(stack, mask)  # the same axis order as the product gives to the network
     return scored(true.image, true.mask, true.spacing_mm.tolist(), options.masks)
 
 
 def measure_written(pairs: Sequence[tuple[Path, Path]], options: argparse.Namespace) -> Row:
-    """The masks of a subject as they are written, each beside the one drawn by hand.
+    """Overlap of the masks written for a subject with the hand-drawn masks.
 
     Args:
-        pairs: files of the stacks and of the masks drawn on them.
+        pairs: files of the stacks and of their hand-drawn masks.
         options: of the command.
     """
     drawn = _loaded(pairs)
@@ -99,11 +99,11 @@ def measure_written(pairs: Sequence[tuple[Path, Path]], options: argparse.Namesp
 
 
 def measure_predicted(pairs: Sequence[tuple[Path, Path]], left_out: int, options: argparse.Namespace) -> Row:
-    """How well volumes of the other stacks predict one, by whose masks they were made, where both show the brain.
+    """Prediction of one stack by volumes of the others, made with found and with drawn masks, where both were seen.
 
     Args:
-        pairs: files of the stacks and of the masks drawn on them.
-        left_out: number of the one to predict, in its own drawn mask.
+        pairs: files of the stacks and of their hand-drawn masks.
+        left_out: number of the stack to predict, within its own drawn mask.
         options: of the command.
     """
     stacks = _loaded(pairs)
@@ -134,7 +134,7 @@ def _found(stacks: Sequence[Stack], source: str | None) -> list[Stack]:
 
 
 def said(key: str, row: Row) -> str:
-    """A finished measurement."""
+    """Progress line of a finished measurement."""
     if "written" in row:
         return f"{key}: Dice " + ", ".join(f"{one['dice']:.3f}" for one in row["written"].values())
     if "predicted" in row:
@@ -148,11 +148,11 @@ WRITTEN: dict[str, Cell] = {
     "predicted, masks drawn, dB": lambda row: f"{row['drawn_db']:.2f}" if "drawn_db" in row else "-",
     "predicted, masks found, dB": lambda row: f"{row['found_db']:.2f}" if "found_db" in row else "-",
 }
-"""Columns of the table of masks as they are written."""
+"""Columns of the table of written masks."""
 
 
 def tables(record: Record) -> dict[str, str]:
-    """What the network finds, and what is written; a row per stack."""
+    """Tables of the masks that the network finds and of the written masks, a row per stack."""
     rows = record["rows"]
     alone = [{"name": name, **row} for name, row in rows.items() if "dice" in row]
     written = [

@@ -18,20 +18,20 @@ from studies.subjects import data_folder
 from studies.tables import details, table
 
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
-"""None was trained on, and no checkpoint chosen by them."""
+"""Volumes that were used neither for training nor for the choice of a checkpoint."""
 DEVELOPMENT_VOLUMES = ("spina-bifida/sb26-operated", "spina-bifida/sb29-operated", "spina-bifida/sb33-operated")
-"""Checkpoints were chosen by operated ones."""
+"""Volumes for development, since checkpoints were chosen on operated volumes."""
 FIRST_SEED, DEVELOPMENT_SEED = 71_000, 70_000
 N_HEADS, N_WITHOUT = 100, 20
 PIXEL_RANGE_MM = (0.7, 1.5)
 HEAD_SPACING_MM = 1.2
 NEAR_MM = 5.0
 MIN_TRUE_ML = 5.0
-"""Stacks that hold less brain than this are drawn anew: there is nothing to reconstruct."""
+"""Stacks with less brain than this are drawn again, because there is nothing to reconstruct."""
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per stack; those without a head come last."""
+    """One task per stack; stacks without a head come last."""
     for n in range(options.heads + options.without):
         volumes = DEVELOPMENT_VOLUMES if options.development else VOLUMES
         name = volumes[n % len(volumes)]
@@ -41,7 +41,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(name: str, n: int, without: bool, options: argparse.Namespace) -> Row:
-    """One stack.
+    """Overlap of the found mask with the true mask of one simulated stack.
 
     Args:
         name: of the atlas subject.
@@ -76,7 +76,7 @@ def _head(name: str) -> TruthVolume:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """What holds of all stacks, and each."""
+    """Summary of all stacks, then a row for each."""
     rows = [{"name": name, **row} for name, row in record["rows"].items()]
     heads, without = [row for row in rows if row["head"]], [row for row in rows if not row["head"]]
     false = sum(row["found"] for row in without)

@@ -1,4 +1,4 @@
-"""Simulated subjects, whose stacks are black around the brain, put into surroundings of the mask networks' scenes."""
+"""Simulated subjects, whose stacks are black around the brain, placed in the surroundings of the training scenes."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from g3r.evaluation.case import SimulatedCase
 from g3r.geometry import RigidPose, VolumeGrid
 
 FIELD_OF_VIEW_MM = 280.0
-"""In the plane; real stacks of a uterus have 250 to 400 mm."""
+"""Edge of the field of view in plane; real stacks of a uterus have 250 to 400 mm."""
 
 SLICES_BEYOND = 4
-"""On each side of a stack: nobody plans one that ends with the brain."""
+"""Slices added at each end of a stack, because real stacks are planned to reach beyond the brain."""
 
 N_THROUGH = 3
 
 MAX_UNSEEN_MM2 = 100.0
-"""Of a slice without a pixel of the case's own, that lies in the brain: beyond it the scene would be a hollow skull."""
+"""Largest brain area in a slice without a masked pixel of the case. A slice with more brain stays black, because the
+scene would show a hollow skull."""
 
 
 def surrounded(case: SimulatedCase, seed: int) -> list[Stack]:
-    """The stacks of a case in a larger field of view, with everything around the brain, and their true masks.
+    """The stacks of a case with simulated surroundings in a larger field of view, and their true masks.
 
-    Skull, scalp, face and neck move with the brain as the true poses say. The mother lies still in each stack, where
-    its middle slice saw the head.
+    Skull, scalp, face and neck move with the brain by the true poses. The mother does not move within a stack; she is
+    placed by the pose of its middle slice.
 
     Args:
         case: black outside the masks.
@@ -58,7 +59,7 @@ def surrounded(case: SimulatedCase, seed: int) -> list[Stack]:
 
 
 def _box(head: SceneHead, truth: TruthVolume) -> tuple[slice, ...]:
-    """Where the truth lies on the grid of the head."""
+    """The part of the head's grid that the truth covers."""
     offset = np.rint(VolumeGrid(head.labels.shape, head.affine).index(truth.affine[:3, 3])).astype(int)
     return tuple(slice(o, o + n) for o, n in zip(offset, truth.mask.shape, strict=True))
 
@@ -66,7 +67,7 @@ def _box(head: SceneHead, truth: TruthVolume) -> tuple[slice, ...]:
 def _without_brain(
     head: SceneHead, truth: TruthVolume, mean: NDArray[np.float32], texture: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """The head's channels (see `image_slices`), black where the case itself shows the brain."""
+    """The head's channels (see `image_slices`), black where the case shows the brain."""
     brain = np.zeros(head.labels.shape, bool)
     brain[_box(head, truth)] = truth.mask
     shells = np.zeros((*head.labels.shape, 3), np.float32)
@@ -86,26 +87,26 @@ def _in_scene(
     around: Surroundings,
     behind: NDArray[np.float32],
 ) -> Stack:
-    """One stack: the case's own pixels where they show brain, the scene around them, as bright as the slice is.
+    """One stack with surroundings: the brain pixels of the case, and the scene around them with the gain of each slice.
 
-    Where a slice of the case ends within the brain, the truth goes on. Slices beyond those of the case that would show
-    brain are black: nothing is known of what they would show.
+    Where a slice of the case ends within the brain, it is continued by the truth. A slice of which the case shows
+    nothing although it crosses the brain is black, since its content is unknown.
 
     Args:
-        case: that it belongs to.
+        case: of the stack.
         number: of the stack.
-        middle_mm: [3] of the brain in the truth's frame, the origin of the scene.
-        head: gives the grid of the shells.
+        middle_mm: [3] centre of the brain in the truth's frame, the origin of the scene.
+        head: gives the grid of the head's channels.
         channels: [I, J, K, 3] of the head without brain, and of the brain alone.
         around: gives the grid of the surroundings.
-        behind: [N, N, N] their intensities.
+        behind: [N, N, N] intensities of the surroundings.
     """
     stack = _widened(case.stacks[number])
     n_slices = stack.image.shape[2]
     header = _slice_poses(stack)
     rows = [row for row, key in enumerate(case.true.keys) if key[0] == number]
     own = np.array([case.true.keys[row][1] for row in rows]) + SLICES_BEYOND
-    nearest = np.abs(np.arange(n_slices)[:, None] - own).argmin(1)  # slices without brain have no pose of their own
+    nearest = np.abs(np.arange(n_slices)[:, None] - own).argmin(1)  # slices without brain have no true pose
     moved = case.true.pose.take(np.array(rows)[nearest])
     origin = RigidPose.from_rotvec(np.zeros((1, 3)), -middle_mm[None])
     head_pose = origin @ moved @ header
@@ -148,7 +149,7 @@ def _beyond(stack: Stack, widened: Stack) -> NDArray[np.bool_]:
 
 
 def _gain(stack: Stack, truth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Brightness [S] of the slices over that of the truth; the usual one where a slice shows no brain."""
+    """Gain [S] of the slices relative to the truth; the median gain for a slice without brain."""
     own, square = ((one * stack.mask).sum((0, 1)) for one in (stack.image * truth, truth**2))
     shows = square > 0
     gain = np.full(len(own), np.median(own[shows] / square[shows]))
@@ -157,7 +158,7 @@ def _gain(stack: Stack, truth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _widened(stack: Stack) -> Stack:
-    """The stack with black around it up to the field of view, and black slices at both ends."""
+    """The stack padded with black to the field of view, and with black slices at both ends."""
     missing = np.maximum((FIELD_OF_VIEW_MM / stack.spacing_mm[:2] - stack.image.shape[:2]) / 2, 0).astype(int)
     pad = [(int(missing[0]),) * 2, (int(missing[1]),) * 2, (SLICES_BEYOND,) * 2]
     affine = stack.affine.copy()
@@ -167,7 +168,7 @@ def _widened(stack: Stack) -> Stack:
 
 
 def _slice_poses(stack: Stack) -> RigidPose:
-    """By the header: the middle of each slice's pixel grid, and its axes."""
+    """Slice poses by the header: the centre of each slice's pixel grid, and its axes."""
     n_i, n_j, n_slices = stack.image.shape
     axes = stack.affine[:3, :3] / stack.spacing_mm
     frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)

@@ -1,1 +1,1 @@
-"""Registration measured: the tables of docs/motion.md."""
+"""Accuracy of registration: the tables of docs/motion.md."""

@@ -15,14 +15,14 @@ from studies.tables import Cell, table
 
 BIASES = (0.05, 0.15)
 VOLUMES = ("crl-sta/sta30", "spina-bifida/sb32-operated")
-"""A week excluded from training, and a volume that training used for choosing only."""
+"""A week excluded from training, and a volume that training used only for the choice of checkpoints."""
 
 SEED = 33_000
-"""Seeds from here on belong to this study; a volume has the same at every strength of the bias field, so that
-motion, noise and the shape of the field agree."""
+"""First seed of this study. A volume has the same seed at every strength of the bias field, so that motion, noise and
+the shape of the field are the same."""
 
 VARIANTS: dict[str, Mapping[str, Any]] = {"estimated": {}, "not estimated": {"slice_stage.optimise_bias_field": False}}
-"""Variants compared; options as `g3r.planning.presets.changed` reads them."""
+"""Variants that are compared, with changes of the settings as for `g3r.planning.presets.changed`."""
 
 
 def specs(n_repeats: int = 1) -> list[SubjectSpec]:
@@ -43,14 +43,14 @@ def specs(n_repeats: int = 1) -> list[SubjectSpec]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every variant of every subject."""
+    """One task per variant of every subject."""
     settings = PRESETS[options.preset]
     for spec in specs(options.repeats):
         for variant, changes in VARIANTS.items():
             chosen = changed(settings, changes)
             if options.motion_only and chosen != settings and chosen.registration == settings.registration:
-                continue  # registration would do the same again
-            # without the fit, settings left as they are say nothing about the bias field
+                continue  # registration would give the same result
+            # registration alone has no fit, so unchanged settings do not mean that the field is estimated
             label = "-" if options.motion_only and not changes else variant
             yield Task(f"{spec.name}, {label}", measure, (spec, label, changes, options))
 

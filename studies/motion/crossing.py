@@ -19,15 +19,15 @@ from studies.tables import Cell, details, table
 VOLUMES = ("crl-sta/sta26", "spina-bifida/sb28-operated", "crl-sta/sta32")
 
 TILTS_DEG = (0.0, 12.0, 20.0, 28.0, 36.0)
-"""Standard deviation, per axis, of the tilt of either stack. What the head turns between both comes on top."""
+"""Standard deviation, per axis, of the tilt of each stack. Rotation of the head between the stacks adds to it."""
 
 LEVELS = ("mild", "moderate", "severe")
 
 FIRST_SEED = 75_000
-"""`MIN_CROSSING_DEG` was chosen by these subjects; to judge it anew, take others."""
+"""First seed. `MIN_CROSSING_DEG` was chosen on these subjects; to validate it, use others."""
 
 EDGES_DEG = (0, 15, 30, 45, 91)
-"""Of the rows of the table."""
+"""Limits of the ranges of angles in the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,13 +37,13 @@ class TiltedSubject(SubjectSpec):
     tilt_deg: float
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """How its stacks are taken."""
+        """Acquisition settings of its stacks."""
         axial = super().acquisition(1)[0]
         return [replace(axial, oblique_deg=self.tilt_deg)] * 2
 
 
 def specs() -> list[TiltedSubject]:
-    """Every tilt of every head at every level of motion; each with a seed of its own."""
+    """Every tilt of every head at every level of motion, each with its own seed."""
     chosen: list[TiltedSubject] = []
     for level in LEVELS:
         for tilt_deg in TILTS_DEG:
@@ -55,19 +55,19 @@ def specs() -> list[TiltedSubject]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per subject."""
+    """One task per subject."""
     for spec in specs():
         yield Task(spec.name, measure, (spec, options))
 
 
 def measure(spec: TiltedSubject, options: argparse.Namespace) -> Row:
-    """One subject."""
+    """Register one subject and compare it with the truth."""
     _, row = run(simulated_case(spec, options.cache), options, full=False)
     return {"level": spec.motion, "tilt_deg": spec.tilt_deg, **row}
 
 
 def line(name: str, row: Row) -> str:
-    """A finished subject."""
+    """Progress line of a finished subject."""
     angle = f"{row['crossing_deg']:.0f} degrees"
     return f"{name}: {angle}, TRE median {row['median_mm']:.2f} mm, off {row['off_share']:.1%}"
 
@@ -92,7 +92,7 @@ def _is_bad(row: Row) -> bool:
 
 
 def _otherwise_warned(row: Row) -> bool:
-    """Whether anything but the angle is warned about."""
+    """Whether there is a warning about anything but the angle."""
     return any(not line.startswith(PARALLEL) for line in row["warnings"])
 
 

@@ -1,4 +1,4 @@
-"""A figure of the pose error of every slice, before registration and after each of its layers."""
+"""Figure of the pose error of every slice, before registration and after each of its layers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ INTERLEAVE = 2
 
 JERK_MM = 2.5
 JERK_RATIO = 3.0
-"""A step between neighbours in time is a jerk if it is longer than this, and longer than the median step by this
-factor: the walks of all levels stay under, jerks of 6 degrees (4 mm at the rim of a head) do not."""
+"""A step between neighbours in time is a jerk if it is longer than JERK_MM and than JERK_RATIO times the median step.
+The random walks of all levels stay below; jerks of 6 degrees (4 mm at the rim of a head) do not."""
 
 MIN_SHOWN_MM = 0.01
-"""Smaller errors are drawn here: a logarithm has no zero."""
+"""Smaller errors are drawn at this value, because the axis is logarithmic."""
 
 GAP_SLICES = 4
-"""Empty places between two stacks."""
+"""Gap between two stacks on the x-axis, in slices."""
 
 COLOURS = {
     "headers": "#b8b8b8",
@@ -38,13 +38,13 @@ COLOURS = {
     "joint": "#d55e00",
 }
 SHOWN = ("headers", "best start", "segments", "slices", "joint")
-"""Those that the figure draws; more dots than these hide each other."""
+"""Layers that the figure shows; the dots of more layers would hide each other."""
 
 OTHER_COLOURS = ("#000000", "#7f3c8d", "#3969ac")
 
 
 def places_in_time(n_slices: int, interleave: int = INTERLEAVE) -> NDArray[np.int64]:
-    """When each slice of a stack was taken [n_slices]."""
+    """Acquisition rank of each slice of a stack [n_slices]."""
     place = np.empty(n_slices, np.int64)
     place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
     return place
@@ -53,7 +53,7 @@ def places_in_time(n_slices: int, interleave: int = INTERLEAVE) -> NDArray[np.in
 def jerk_slices(
     true: PoseTable, points_mm: Mapping[SliceKey, NDArray[np.float64]], interleave: int = INTERLEAVE
 ) -> list[list[int]]:
-    """Stack and place in time of each first slice after a sudden movement, by the true poses.
+    """Stack and acquisition rank of each first slice after a jerk, by the true poses.
 
     Args:
         true: the true poses.
@@ -74,7 +74,7 @@ def jerk_slices(
 
 
 def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = INTERLEAVE) -> None:
-    """Draw a panel per case of what `studies.motion.layers` measured, and write it as PNG.
+    """Draw the slice errors measured by `studies.motion.layers`, a panel per case, and write them as PNG.
 
     Args:
         cases: rows of its record.
@@ -124,7 +124,7 @@ def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = IN
 
 
 def _stack_starts(n_slices: Sequence[int]) -> list[int]:
-    """Where each stack begins on the x-axis."""
+    """Start of each stack on the x-axis."""
     return [0, *(np.cumsum(n_slices[:-1]) + GAP_SLICES * np.arange(1, len(n_slices))).tolist()]
 
 

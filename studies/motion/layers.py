@@ -1,4 +1,4 @@
-"""`python -m studies.motion.layers`: what each layer of registration brings and costs on known cases."""
+"""`python -m studies.motion.layers`: gain and cost of each layer of registration on known cases."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _ONE_START = {
 
 @dataclass(frozen=True)
 class Layer:
-    """One more layer than the row before.
+    """A layer of registration, measured after it and all earlier layers.
 
     Args:
         name: in tables and figures.
         options: settings with which registration ends after this layer (see `g3r.planning.presets.changed`).
-        full: whether the layer is part of the fit, so that the whole reconstruction is run.
+        full: whether the layer is part of the fit, which requires the whole reconstruction.
     """
 
     name: str
@@ -50,7 +50,7 @@ LAYERS = (
     Layer("slices"),
     Layer("joint", full=True),
 )
-"""In the order in which they follow on the headers; the first three each compete with the headers alone."""
+"""Layers in their order after the headers. Each of the first three alone competes with the headers."""
 
 WITHOUT: dict[str, Options] = {
     "template": {"registration.template": False},
@@ -66,13 +66,13 @@ WITHOUT: dict[str, Options] = {
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case."""
+    """One task per case."""
     for folder in case_folders(options.cases):
         yield Task(folder.name, measure, (folder, options))
 
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
-    """Errors after each layer, and scores with everything and without a layer."""
+    """Errors after each layer, and scores of the product and of the product without each layer."""
     case = read_case(folder)
     header = case.header_error()
     layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}
@@ -104,7 +104,7 @@ def _say(case: str, what: str, row: Row) -> None:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Errors and seconds after each layer, volumes without a layer."""
+    """Tables of errors and seconds after each layer, and of volumes without one layer."""
     rows = [{"case": case, **row} for case, row in record["rows"].items()]
     layers = list(dict.fromkeys(name for row in rows for name in row["layers"]))
     variants = list(dict.fromkeys(name for row in rows for name in row["without"]))

@@ -16,23 +16,23 @@ from studies.tables import Cell, details, table
 
 LEVELS = ("mild", "moderate", "severe")
 WANTED_SHARE = {"mild": 0.95, "moderate": 0.90, "severe": 0.60}
-"""Share of subjects that should end with their median slice under a millimetre."""
+"""Share of subjects that should have a median slice error under 1 mm."""
 
 UPRIGHT_DEG = 5.0
 MAX_SUBJECTS = 100
 
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
-"""Weeks that no training has seen."""
+"""Weeks that were not used for training."""
 
 FIRST_SEED = 44_000
-"""Seeds 44000-44299 belong to the published table: no training and no choice may use them. (41000-41299 did
-until they had shown that stacks with jerks must not return to their motion segments.)"""
+"""Seeds 44000-44299 belong to the published table: no training and no choice of settings may use them. (Seeds
+41000-41299 did until they had shown that stacks with jerks must not return to their motion segments.)"""
 
 TURNED_SEED = 42_000
-"""The same for subjects in a random orientation (`--turned`)."""
+"""First seed of the published table for subjects in a random orientation (`--turned`)."""
 
 DEVELOPMENT_SEED = 31_000
-"""Seeds 31000-31299 were looked at while registration was made (`--development`); so measure on others."""
+"""Seeds 31000-31299 were looked at while registration was developed (`--development`), so they may not be published."""
 
 
 def specs(
@@ -44,7 +44,7 @@ def specs(
         levels: of motion.
         n_subjects: at each level.
         turned: whether heads are in random orientations.
-        development: whether they may be looked at.
+        development: whether to take the subjects for development.
     """
     first = TURNED_SEED if turned else FIRST_SEED
     if development:
@@ -59,19 +59,19 @@ def specs(
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per subject."""
+    """One task per subject."""
     for spec in specs(options.levels, options.subjects, turned=options.turned, development=options.development):
         yield Task(spec.name, measure, (spec, options))
 
 
 def measure(spec: SubjectSpec, options: argparse.Namespace) -> Row:
-    """One subject."""
+    """Register one subject and compare it with the truth."""
     case = simulated_case(spec, options.cache)
     header = case.header_error()
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         _, row = run(case, options, full=options.full)
-    except G3RError as error:  # a refusal counts as a row: nothing was moved, and the user was warned
+    except G3RError as error:  # a refusal gives a row too, with the poses of the headers and a warning
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
         row = pose_row(header, [str(error)], seconds, cpu_seconds)
     shown = {"level": spec.motion, "seed": spec.seed, "turned": spec.turned}
@@ -79,7 +79,7 @@ def measure(spec: SubjectSpec, options: argparse.Namespace) -> Row:
 
 
 def line(name: str, row: Row) -> str:
-    """A finished subject."""
+    """Progress line of a finished subject."""
     psnr = f" {row['psnr_db']:.2f} dB," if "psnr_db" in row else ""
     return (
         f"{name}: TRE median {row['median_mm']:.2f}, p90 {row['p90_mm']:.2f} mm,{psnr} "
@@ -88,7 +88,7 @@ def line(name: str, row: Row) -> str:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A text for upright heads and one for heads in random orientations: a row per level, one per subject."""
+    """Tables for upright heads and for heads in random orientations: a row per level, then a row per subject."""
     found = {}
     for marker, turned in (("sweep", False), ("sweep-turned", True)):
         rows = {name: row for name, row in record["rows"].items() if row["turned"] is turned}
@@ -98,7 +98,7 @@ def tables(record: Record) -> dict[str, str]:
 
 
 def sweep_text(record: Record, rows: dict[str, Row]) -> str:
-    """The tables of subjects by name, of a record with these settings."""
+    """The tables of the given rows, with the settings of the record."""
     full = bool(record["full"])
     summary_psnr: dict[str, Cell] = {"PSNR dB": lambda row: _psnr(row["of"])} if full else {}
     each_psnr: dict[str, Cell] = {"PSNR dB": lambda row: _psnr([row], 2)} if full else {}
@@ -127,7 +127,7 @@ def _count(warned: bool, bad: bool) -> Callable[[Row], int]:
 
 
 def _off(group: Sequence[Row], *, silent: bool = False) -> list[float]:
-    """Shares of what volumes are made of that are in a wrong place; of those without a warning alone, if asked."""
+    """Misplaced shares of the brain in slices, per subject; with `silent`, only for subjects without a warning."""
     return [one["off_share"] for one in group if one["off_share"] is not None and not (silent and one["warned"])]
 
 
@@ -136,7 +136,7 @@ def _percent(shares: Sequence[float]) -> str:
 
 
 def _psnr(group: Sequence[Row], digits: int = 1) -> str:
-    """Median over those that gave a volume."""
+    """Median PSNR of the subjects that gave a volume."""
     found = [row["psnr_db"] for row in group if "psnr_db" in row]
     return f"{median(found):.{digits}f}" if found else "none"
 

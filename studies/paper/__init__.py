@@ -1,1 +1,1 @@
-"""What docs/paper.md shows: the paper's protocol with this code, baselines, and other programs on the same subjects."""
+"""The paper's protocol with this code, baselines and other programs on the same subjects: docs/paper.md."""

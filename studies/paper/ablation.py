@@ -1,4 +1,4 @@
-"""Fig. 4A: the product without its parts, from three, two and one stacks, after one registration that all share."""
+"""Ablation of Fig. 4A: the product without its parts, from three, two and one stacks, after one common registration."""
 
 from __future__ import annotations
 
@@ -29,20 +29,21 @@ VARIANTS: dict[str, Mapping[str, Any]] = {
     NO_PRIOR: {"use_prior": False},
     HELD_STILL: {"pose_rounds.single_stack": 0, "slice_stage.optimise_poses": False},
 }
-"""As changes of the settings. With several stacks the shipped settings anneal linearly, as the paper has it. Slices of
-a single stack move after registration only where distillation holds the volume (`adapted`), so that its row without
-distillation is to be compared with the one in which slices stay."""
+"""Variants as changes of the settings. With several stacks the shipped settings anneal linearly, as in the paper.
+Slices of a single stack move after registration only if distillation holds the volume (`adapted`), so the variant
+without distillation is to be compared with the variant in which slices stay."""
 
 FOR_SINGLE = (LINEAR, HELD_STILL)
-"""Variants of a single stack alone: the first is what ships with several, the second explains the row above it."""
+"""Variants for a single stack only. LINEAR is the shipped annealing for several stacks; HELD_STILL is the reference for
+the variant without distillation."""
 
 
 def measure_variants(spec: PaperSubject, n_stacks: int, options: argparse.Namespace) -> Row:
-    """One subject with every variant; "skipped" says why where g3r refuses it.
+    """Measure every variant on one subject; "skipped" holds the reason if g3r refuses it.
 
     Args:
         spec: the subject.
-        n_stacks: its first so many.
+        n_stacks: number of its first stacks to use.
         options: of the command.
     """
     row: Row = {"subject": spec.name, "motion": spec.motion, "n_stacks": n_stacks, "kind": "variants"}

@@ -31,14 +31,14 @@ def heads(motion: str, options: argparse.Namespace) -> list[PaperSubject]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Those of all measurements whose key has a part that matches --cases."""
+    """The tasks of `all_tasks` whose key has a part that matches --cases."""
     for task in all_tasks(options):
         if any(fnmatch(task.key, f"*{pattern}*") for pattern in options.cases):
             yield task
 
 
 def all_tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Methods of all subjects, three stacks with moderate motion first; then the parts of Fig. 4A."""
+    """Tasks of all methods and subjects, three stacks with moderate motion first; then the variants of Fig. 4A."""
     why = why_no_lpips(options.lpips_weights)
     options.with_lpips = not why
     if why:
@@ -54,7 +54,7 @@ def all_tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished measurement."""
+    """Progress line of a finished measurement."""
     if "skipped" in row:
         return f"{key}: skipped"
     found = {name: one.get("mask", one)["psnr_db"] for name, one in row["scores"].items()}
@@ -62,7 +62,7 @@ def line(key: str, row: Row) -> str:
 
 
 def settings(options: argparse.Namespace) -> Record:
-    """What rows depend on."""
+    """Settings that the rows of the record depend on."""
     return {
         "subjects": f"volumes of {options.atlas.name}" if options.atlas else PHANTOMS,
         "why_no_lpips": why_no_lpips(options.lpips_weights),
@@ -70,7 +70,7 @@ def settings(options: argparse.Namespace) -> Record:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """All tables, with what they were measured on."""
+    """All tables, with their subjects and settings."""
     rows = [row for row in record["rows"].values() if "skipped" not in row]
     seconds = mean(row["seconds"] for row in rows if "stages" in row) if any("stages" in r for r in rows) else 0
     made = (

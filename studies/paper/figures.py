@@ -19,19 +19,19 @@ SHOWN = (PRODUCT, PRIOR, VARIATION, SQUARES, FILL, PRINTED, EXACT, EXACT + OWN, 
 
 
 def suffix(record: Record) -> str:
-    """What tells tables and pictures of atlas volumes from those of phantoms."""
+    """Suffix of the names of tables and pictures, which differs between atlas volumes and phantoms."""
     return "" if record["subjects"] == PHANTOMS else "-atlas"
 
 
 def draw(record: Record, options: argparse.Namespace) -> None:
-    """The pictures of three stacks and of one beside `options.figure`, and the curve."""
+    """Draw the pictures of three stacks and of one stack, next to `options.figure`, and the curve."""
     path: Path = options.figure
     for n, name in ((3, f"paper-methods{suffix(record)}.png"), (1, f"paper-one-stack{suffix(record)}.png")):
         rows = [row for row in rows_of(record, "methods", motion="moderate", n_stacks=n) if "stages" in row]
         found = [(row, options.output / "sections" / f"{row['subject']}-{n}.npz") for row in rows]
         there = [(row, file) for row, file in found if file.is_file()]
         if there:
-            # the one in the middle by age: neither the smooth youngest nor the most folded
+            # the subject of median age: neither the smoothest nor the most folded brain
             row, file = sorted(there, key=lambda pair: pair[0]["weeks"])[len(there) // 2]
             titles = {k: f"{v['mask']['psnr_db']:.1f} dB" for k, v in row["scores"].items()}
             draw_methods(file, SHOWN, path.with_name(name), titles | {"truth": f"{row['weeks']:.0f} weeks"})
@@ -39,7 +39,7 @@ def draw(record: Record, options: argparse.Namespace) -> None:
 
 
 def _draw_variants(record: Record, path: Path) -> None:
-    """Fig. 4A: mean PSNR of each variant against the number of stacks."""
+    """Draw Fig. 4A: mean PSNR of each variant against the number of stacks."""
     rows = rows_of(record, "variants")
     if not rows:
         return

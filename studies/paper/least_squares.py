@@ -2,9 +2,10 @@
 
     minimise over V:  sum_p w_p (A V - y)_p^2  +  s r sum of rho(grad V)
 
-rho is the square (Tikhonov), or the length with a rounded tip (total variation). The second is solved as a sequence of
-weighted squares (lagged diffusivity, Vogel and Oman 1996). A is g3r's own operator with the profile of the product's
-fit, r the mean coverage of a voxel. What lies beside the brain is not taken out of the pixels of the rim.
+rho is the square of the gradient's length (Tikhonov), or the length with a rounded tip (total variation). Total
+variation is solved as a sequence of weighted least-squares problems (lagged diffusivity, Vogel and Oman 1996). A is
+g3r's own operator with the slice profile of the product's fit, r the mean coverage of a voxel. The surroundings of the
+brain are not subtracted from the pixels of the rim.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class Regulariser:
-    """How a volume is kept smooth.
+    """Regulariser of a least-squares volume.
 
     Args:
         strength: s; relative, so that it does not depend on the number of slices.
-        tip: length of the gradient (of intensities of order one, from voxel to voxel) below which total variation is
-            round; None for Tikhonov.
-        n_rounds: solutions with weights of the one before.
-        n_iterations: conjugate-gradient steps of each.
+        tip: gradient length (of intensities of order one, from voxel to voxel) below which total variation is
+            rounded; None for Tikhonov.
+        n_rounds: number of solutions, each with the weights from the previous one.
+        n_iterations: conjugate-gradient steps per solution.
     """
 
     strength: float
@@ -52,10 +53,10 @@ def least_squares_volume(
     """The volume [I, J, K] on the grid of the initial volumes, started from V_coarse.
 
     Args:
-        volumes: of the slices in their poses.
+        volumes: initial volumes of the posed slices.
         gain: [K] intensity factors.
         weight: [K] slice weights.
-        regulariser: how it is kept smooth.
+        regulariser: Tikhonov or total variation.
         widths: of each stack's profile through the plane, see `SliceModel.applied`.
     """
     slices, grid = SliceModel().applied(volumes.slices, widths), volumes.grid
@@ -87,10 +88,10 @@ TOTAL_VARIATION = Regulariser(strength=0.01, tip=0.02, n_rounds=4, n_iterations=
 
 
 def tuned(atlas: bool, n_stacks: int) -> tuple[Regulariser, Regulariser]:
-    """Tikhonov and total variation as strong as `studies.paper.tuning` found best, on other subjects.
+    """Tikhonov and total variation with the strengths that `studies.paper.tuning` found best on other subjects.
 
     Args:
-        atlas: for atlas volumes; else for phantoms, whose tissues are flat.
+        atlas: True for atlas volumes, False for phantoms, whose tissues have almost uniform intensity.
         n_stacks: of the subject.
     """
     if not atlas:

@@ -1,4 +1,4 @@
-"""All methods on one subject: the product, baselines in its poses, and baselines in poses of their own."""
+"""All methods on one subject: the product, baselines in the product's poses, and baselines in their own poses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ METHODS = (
     VARIATION + OWN,
     EXACT + OWN,
 )
-"""In the order of the tables."""
+"""Methods in the order of the tables."""
 
 NO_NETWORK = tuple(name for name in METHODS if name.startswith((SCATTER, SQUARES, VARIATION, FILL)))
 UNCONSTRAINED = tuple(name for name in METHODS if name.startswith((PRINTED, EXACT)))
@@ -57,7 +57,7 @@ CLASSICAL = {
     "registration.network": False,
     "registration.standard_orientation": False,
 }
-"""Registration without anything that was learned."""
+"""Settings of registration without learned parts."""
 
 AFTER_PRIOR = (
     Stage.FIT_TO_PRIOR,
@@ -67,15 +67,15 @@ AFTER_PRIOR = (
     Stage.PRIOR_SHARE,
     Stage.UNCERTAINTY,
 )
-"""Stages without which V_prior is there."""
+"""Stages that are not needed for V_prior."""
 
 
 def measure_methods(spec: PaperSubject, n_stacks: int, options: argparse.Namespace) -> Row:
-    """One subject by every method; "skipped" says why where g3r refuses it.
+    """Measure every method on one subject; "skipped" holds the reason if g3r refuses it.
 
     Args:
         spec: the subject.
-        n_stacks: its first so many.
+        n_stacks: number of its first stacks to use.
         options: of the command.
     """
     case = paper_case(spec, options.atlas, options.cache, n_stacks)
@@ -142,7 +142,7 @@ def _measured(case: SimulatedCase, options: argparse.Namespace, name: str) -> Ro
 
 
 def classical_poses(case: SimulatedCase, widths: Sequence[float] | None, options: argparse.Namespace) -> Posed:
-    """The subject in poses of registration alone, without networks and templates.
+    """The subject's slices in poses of classical registration alone, without networks and templates.
 
     Args:
         case: the subject.
@@ -155,12 +155,12 @@ def classical_poses(case: SimulatedCase, widths: Sequence[float] | None, options
 
 
 def template_and_printed(posed: Posed, reconstructor: GaussianReconstructor, motion: Registration) -> Iterator[Made]:
-    """The baselines that are made in the poses of the product alone: the template, and Eq. 5 as it is printed.
+    """The baselines that are made only in the poses of the product: the template, and Eq. 5 as printed.
 
     Args:
         posed: the slices.
         reconstructor: with the template.
-        motion: registration, which says where the template lies.
+        motion: registration, which places the template.
     """
     volumes = posed.volumes
     start = time.perf_counter()
@@ -174,14 +174,14 @@ def template_and_printed(posed: Posed, reconstructor: GaussianReconstructor, mot
 
 
 def baselines(posed: Posed, reconstructor: GaussianReconstructor) -> Iterator[Made]:
-    """The baselines that need nothing but slices in poses.
+    """The baselines that need only posed slices.
 
     Args:
         posed: the slices.
-        reconstructor: whose settings say how many Gaussians there are.
+        reconstructor: whose settings determine the number of Gaussians.
     """
     volumes, gain, weight = posed.volumes, posed.gain, posed.weight
-    # the sharpest first: its alignment is that of its frame
+    # the sharpest first, because its alignment to the truth is reused for its frame
     for name, regulariser in ((VARIATION, posed.regularisers[1]), (SQUARES, posed.regularisers[0])):
         start = time.perf_counter()
         yield posed.made(name, least_squares_volume(volumes, gain, weight, regulariser, posed.widths), start)

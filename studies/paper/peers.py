@@ -1,9 +1,9 @@
-"""Other programs on the same subjects: a command with places for the files, and the volume that it leaves.
+"""Other programs on the same subjects: a command with placeholders for the files, and the volume that it writes.
 
     --peer nesvor='nesvor reconstruct --input-stacks {stacks} --stack-masks {masks} --thicknesses {thicknesses}
                    --output-volume {output}'
 
-The command runs without a shell, in a folder of its own. The files are those of the simulated subject.
+The command runs without a shell, in its own folder. The files are those of the simulated subject.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from studies.paper.subjects import PaperSubject, paper_case
 PLACES = ("stacks", "masks", "thicknesses", "output")
 
 TAIL_LINES = 3
-"""Of what a failed program printed, in the record."""
+"""Number of last lines printed by a failed program that are kept in the record."""
 
 
 @dataclass(frozen=True)
 class Peer:
-    """A program by its name in the tables and its command."""
+    """A program: its name in the tables and its command."""
 
     name: str
     command: str
 
 
 def peer(text: str) -> Peer:
-    """NAME=COMMAND, as the type of an option.
+    """Option type: NAME=COMMAND.
 
     Raises:
-        argparse.ArgumentTypeError: no name, no {stacks} or {output}, or another place than those of `PLACES`.
+        argparse.ArgumentTypeError: no name, no {stacks} or {output}, or a placeholder that is not in `PLACES`.
     """
     name, sign, command = text.partition("=")
     try:
@@ -55,12 +55,12 @@ def peer(text: str) -> Peer:
 
 
 def arguments(one: Peer, folder: Path, n_stacks: int, thickness_mm: float, output: Path) -> list[str]:
-    """The words of a program's command line; a place that stands alone becomes as many words as there are files.
+    """The words of a program's command line; a placeholder that is a word by itself becomes one word per file.
 
     Args:
         one: the program.
         folder: of the simulated subject.
-        n_stacks: its first so many.
+        n_stacks: number of its first stacks to use.
         thickness_mm: of its slices.
         output: where the volume is expected.
     """
@@ -79,11 +79,11 @@ def arguments(one: Peer, folder: Path, n_stacks: int, thickness_mm: float, outpu
 
 
 def measure_peer(spec: PaperSubject, n_stacks: int, one: Peer, options: argparse.Namespace) -> Row:
-    """One subject by another program; "skipped" says why where it leaves no volume.
+    """Measure another program on one subject; "skipped" holds the reason if it writes no volume.
 
     Args:
         spec: the subject.
-        n_stacks: its first so many.
+        n_stacks: number of its first stacks to use.
         one: the program.
         options: of the command.
     """
@@ -114,7 +114,7 @@ def _run(words: list[str], folder: Path, timeout_s: float) -> None:
     """Run a program to its end.
 
     Raises:
-        InputError: it is not there, failed, or took too long.
+        InputError: the program does not exist, failed, or took too long.
     """
     try:
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout_s, check=False)

@@ -16,10 +16,10 @@ from studies.tables import new_figure, save_figure
 TRUTH = "truth"
 
 ERROR_WINDOW = 0.25
-"""Of the data range: where the map of errors is white."""
+"""Error that is white in the map of errors, as a share of the data range."""
 
 DPI = 72
-"""Slices have about a hundred pixels: more would only be larger files."""
+"""Resolution of the PNG. Slices have about a hundred pixels, so more would only make larger files."""
 
 PLANES = ("sagittal", "coronal", "axial")
 
@@ -28,7 +28,7 @@ def keep_sections(path: Path, case: SimulatedCase, volumes: Mapping[str, NDArray
     """Write the middle slices of volumes in three planes, in units of the data range of the truth.
 
     Args:
-        path: .npz to write; a stack [3 planes] of each method, filled with zeros to one size.
+        path: .npz to write, with an array [3 planes] per method, zero-padded to one size.
         case: with the truth and its mask.
         volumes: [I, J, K] on the truth's grid, by method.
     """
@@ -56,7 +56,7 @@ def draw_methods(sections: Path, methods: Sequence[str], path: Path, titles: Map
 
     Args:
         sections: written by `keep_sections`.
-        methods: names, from left to right; those that the file lacks are left out.
+        methods: names, from left to right; methods that the file lacks are left out.
         path: of the PNG.
         titles: a second line below a method's name, such as its score.
     """

@@ -1,4 +1,4 @@
-"""Slices in poses that were found, the volumes that baselines start from, and what a method has made."""
+"""Posed slices with the initial volumes of the baselines, and the resulting volume of a method."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ VOXELS = "voxels"
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """A volume of a method.
+    """The resulting volume of a method.
 
     Attributes:
         name: of the method.
         data: [I, J, K].
         grid: of the data.
-        common: the common motion of its slices, from where the alignment to the truth starts.
-        seconds: wall time; of baselines without that of their poses.
-        frame: volumes of one frame are of the same slices in the same poses, and share one alignment to the truth.
+        common: the common motion of its slices, from which the alignment to the truth starts.
+        seconds: wall time; for baselines without the time for their poses.
+        frame: volumes with the same frame have the same slices in the same poses and share one alignment to the truth.
     """
 
     name: str
@@ -47,20 +47,19 @@ class Made:
 
 @dataclass(frozen=True, kw_only=True)
 class Posed:
-    """Slices in poses that baselines take, and the volumes that they give by themselves.
+    """Posed slices for the baselines, and their initial volumes without a network.
 
-    Their intensities are matched as the product matches them: the field of each stack and the field that all share
-    are divided out.
+    Intensities are matched as in the product: the bias field of each stack and the common bias field are divided out.
 
     Attributes:
-        volumes: of the slices.
+        volumes: initial volumes of the slices.
         gain: [K] intensity factors.
         weight: [K] slice weights.
-        widths: of each stack's profile through the plane, over the nominal one; None takes the usual one.
-        regularisers: Tikhonov's and total variation.
-        support: [I, J, K] what is shown of each baseline: the slices' masks and a margin.
+        widths: width of each stack's profile through the plane, relative to the nominal; None takes the usual widths.
+        regularisers: Tikhonov and total variation.
+        support: [I, J, K] voxels to which every baseline is cut: the slices' masks and a margin.
         error: of the poses.
-        seconds: that these volumes took.
+        seconds: wall time for these volumes.
     """
 
     volumes: InitialVolumes
@@ -86,7 +85,7 @@ class Posed:
         Args:
             case: the subject.
             found: poses, gains and weights of its slices.
-            widths: that the product found for its slices; not taken where other stacks were left out.
+            widths: that the product found for its stacks; ignored if it used another number of stacks.
             atlas: whether it comes from an atlas.
         """
         start = time.perf_counter()
@@ -109,7 +108,7 @@ class Posed:
         Args:
             name: of the method.
             data: [I, J, K].
-            start: when it was begun, in seconds of `time.perf_counter`.
+            start: start of its computation, in seconds of `time.perf_counter`.
             frame: see `Made`.
         """
         shown = np.where(self.support, data, 0).astype(np.float32)
@@ -122,7 +121,7 @@ class Posed:
 def volumes_without_network(
     stacks: Sequence[Stack], found: ReconstructionResult | Registration
 ) -> tuple[InitialVolumes, NDArray[np.float64]]:
-    """What the slices of some stacks give by themselves in poses that were found, and their gains [K].
+    """Initial volumes of posed slices without a network, and the matched gains [K] of the slices.
 
     Args:
         stacks: all that `found` was given.

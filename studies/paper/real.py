@@ -40,16 +40,16 @@ SCORES = {
     "high_pass_ncc": ("high-pass NCC", "{:.4f}"),
     "counted_share": ("counted", "{:.2f}"),
 }
-"""By their key: head of the column and format."""
+"""Column heading and format of each score, by its key."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RealSubject:
-    """Stacks of one head, and repeats that no volume is made from.
+    """Stacks of one head, and repeated stacks that no volume is made from.
 
     Attributes:
         stacks, masks: files, one mask for each stack.
-        repeats, repeat_masks: the same of the repeats.
+        repeats, repeat_masks: files of the repeated stacks and their masks.
     """
 
     stacks: tuple[Path, ...]
@@ -59,7 +59,7 @@ class RealSubject:
 
 
 def subjects(options: argparse.Namespace) -> list[RealSubject]:
-    """The one whose files were given, or those of `real/` in the test data: a folder is a subject.
+    """The subject whose files were given, or those of `real/` in the test data, one folder each.
 
     Raises:
         InputError: no test data, fewer than two stacks, or another number of masks.
@@ -89,7 +89,7 @@ def subjects(options: argparse.Namespace) -> list[RealSubject]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Each stack of each subject left out; then all stacks, where there are repeats to predict."""
+    """A task per left-out stack of each subject, then one with all stacks if there are repeats to predict."""
     for n, subject in enumerate(subjects(options), 1):
         for k in range(len(subject.stacks)):
             yield Task(f"subject {n} without stack {k + 1}", measure, (subject, n, k, options))
@@ -98,7 +98,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(subject: RealSubject, number: int, left_out: int | None, options: argparse.Namespace) -> Row:
-    """One reconstruction, and what it and the other volumes in its poses predict.
+    """One reconstruction, and the predictions of its volume and of the other volumes in its poses.
 
     Args:
         subject: its files.
@@ -125,7 +125,7 @@ def measure(subject: RealSubject, number: int, left_out: int | None, options: ar
         shown = {}
         scores = {}
         for method, (data, grid) in volumes.items():
-            # what counts is the same for all: the brain of the written volume
+            # all methods are scored on the same pixels: the brain of the written volume
             support = on_grid(head, result.grid, grid, 0.0) > 0.5
             volume = Volume(data, grid.affine, method)
             found = predicted_pixels(volume, stack, support=support)
@@ -138,18 +138,18 @@ def measure(subject: RealSubject, number: int, left_out: int | None, options: ar
 
 
 def volumes_of(result: ReconstructionResult, stacks: Sequence[Stack]) -> dict[str, tuple[NDArray[Any], VolumeGrid]]:
-    """All volumes that the slices of a result give in its poses, with their grids; none is cut at a mask.
+    """All volumes in the poses of a result, with their grids; none is cut at a mask.
 
-    Least squares that were cut would be placed a little worse, and would lose up to 0.07 dB by that.
+    Least-squares volumes that are cut at a mask are aligned slightly worse and lose up to 0.07 dB.
 
     Args:
         result: of the stacks.
-        stacks: that it was made of.
+        stacks: that it was made from.
     """
     own, gain = volumes_without_network(stacks, result)
     widths = result.record.held_out.widths if result.record.held_out else None
     made = {SCATTER: own.coarse}
-    # as strong as is best for atlas volumes: those are brains, phantoms are not
+    # strengths tuned on atlas volumes, because they are real brains and phantoms are not
     for name, regulariser in zip((SQUARES, VARIATION), tuned(True, len(stacks)), strict=True):
         made[name] = least_squares_volume(own, gain, result.weight, regulariser, widths)
     return {
@@ -160,7 +160,7 @@ def volumes_of(result: ReconstructionResult, stacks: Sequence[Stack]) -> dict[st
 
 
 def sections(options: argparse.Namespace, number: int, name: str) -> Path:
-    """File of what the picture of a held-out stack shows.
+    """File with the data of the picture of a held-out stack.
 
     Args:
         options: of the command.
@@ -171,13 +171,13 @@ def sections(options: argparse.Namespace, number: int, name: str) -> Path:
 
 
 def settings(options: argparse.Namespace) -> Record:
-    """What rows depend on."""
+    """Settings that the rows of the record depend on."""
     files = [str(path) for one in subjects(options) for path in (*one.stacks, *one.masks, *one.repeats)]
     return {"files": files, "thickness_mm": options.thickness, "eroded_pixels": options.eroded_pixels}
 
 
 def line(key: str, row: Row) -> str:
-    """A finished reconstruction."""
+    """Progress line of a finished reconstruction."""
     texts = []
     for stack, scores in row["scores"].items():
         found = ", ".join(f"{method} {one['psnr_db']:.2f}" for method, one in scores.items())
@@ -186,7 +186,7 @@ def line(key: str, row: Row) -> str:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Means over the held-out stacks, and each of them."""
+    """Table of means over the held-out stacks, and table of every stack."""
     rows = list(record["rows"].values())
     held_out = [
         {"subject": row["subject"], "stack": stack, "of": row["of"], "scores": scores}
@@ -225,10 +225,10 @@ def _psnr(method: str) -> Cell:
 
 
 def finish(record: Record, options: argparse.Namespace) -> None:
-    """Draw the picture, if it was asked for.
+    """Draw the picture, if requested.
 
     Raises:
-        InputError: it would lie in docs/, where no picture of a patient belongs, or its slices were not kept.
+        InputError: it would be written into docs/, where no picture of a patient belongs, or its slices were not kept.
     """
     path = options.picture
     if path is None:

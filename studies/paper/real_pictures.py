@@ -1,4 +1,4 @@
-"""The picture of real stacks: volumes in the same slices and window, and a held-out slice beside its predictions."""
+"""Picture of real stacks: all volumes in the same sections and window, and a held-out slice with its predictions."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from studies.paper.pictures import DPI, PLANES
 from studies.tables import new_figure, save_figure
 
 DIFFERENCE_WINDOW = 0.3
-"""Of the window: where the map of differences is of full colour."""
+"""Difference that has full colour in the map of differences, as a share of the window."""
 
 MARGIN_PIXELS = 4
-"""Around the brain in a held-out slice."""
+"""Margin around the brain in a held-out slice."""
 
 Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """What the picture shows of one method.
+    """Data of one method in the picture.
 
     Attributes:
         planes: the middle slices of its volume in three planes.
         measured: [H, W] the held-out slice, black beside the brain.
-        predicted: [H, W] the same, as the volume predicts it, in the slice's intensities.
+        predicted: [H, W] the prediction of that slice by the volume, in the slice's intensities.
     """
 
     planes: Sequence[Image]
@@ -41,11 +41,11 @@ class Shown:
 
     @classmethod
     def of(cls, volume: Image, mask: NDArray[np.bool_], found: PredictedPixels, k: int) -> Shown:
-        """Of a volume and its prediction.
+        """The data of a volume and its prediction.
 
         Args:
-            volume: [I, J, K] on the grid that all methods share.
-            mask: [I, J, K] of the brain there.
+            volume: [I, J, K] on the common grid of all methods.
+            mask: [I, J, K] of the brain on that grid.
             found: the prediction.
             k: the slice that is shown.
         """
@@ -63,7 +63,7 @@ class Shown:
 
 
 def largest_slice(found: PredictedPixels) -> int:
-    """The slice with most brain: the same for every method."""
+    """The slice with the largest brain area, which is the same for every method."""
     return int(np.argmax(np.bincount(found.slices.pixel_plane, minlength=len(found.slices))))
 
 
@@ -75,7 +75,7 @@ def _around(inside: NDArray[np.bool_]) -> tuple[slice, ...]:
 
 
 def keep_predictions(path: Path, shown: Mapping[str, Shown]) -> None:
-    """Write what the picture shows, so that a later run can draw it.
+    """Write the data of the picture, so that a later run can draw it.
 
     Args:
         path: .npz to write.
@@ -122,7 +122,7 @@ def draw_real(path: Path, methods: Sequence[str], picture: Path) -> None:
 
 
 def _in_one_window(images: Sequence[Image]) -> list[Image]:
-    """Slices of a volume, which has units of its own, so that its 99th percentile is white."""
+    """Sections of a volume in arbitrary units, scaled so that its 99th percentile is white."""
     inside = np.concatenate([image[image > 0] for image in images])
     white = np.percentile(inside, 99) if inside.size else 1.0
     return [(image / white).astype(np.float32) for image in images]

@@ -1,4 +1,4 @@
-"""Scores of a volume as the paper has them, in the mask of the truth and on its whole grid."""
+"""Scores of a volume as in the paper, in the mask of the truth and on its whole grid."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from studies.runs import aligned
 
 @functools.lru_cache(maxsize=1)
 def metric(weights: Path | None) -> Lpips:
-    """LPIPS with the weights of files, read once in a process."""
+    """LPIPS with weights from files, read once per process."""
     return Lpips.load(weights)
 
 
 def why_no_lpips(weights: Path | None) -> str:
-    """Why LPIPS cannot be measured here; empty where it can."""
+    """The reason why LPIPS cannot be measured here; empty if it can."""
     try:
         metric(weights)
     except InputError as error:
@@ -45,17 +45,17 @@ def scored(
     *,
     near: bool = True,
 ) -> tuple[Row, Comparison]:
-    """Scores in the mask of the truth ("mask") and on its whole grid ("grid"), and the volume as it was scored.
+    """Scores in the mask of the truth ("mask") and on its whole grid ("grid"), and the aligned and scaled volume.
 
-    In the mask gain and offset are fitted, as everywhere in g3r; on the grid a factor alone.
+    In the mask, gain and offset are fitted, as everywhere in g3r; on the grid, only a factor.
 
     Args:
         case: with the truth.
         data: [I, J, K] of the volume.
         grid: of the data.
-        truth_from_volume: the common motion of the slices, from where the alignment starts.
+        truth_from_volume: the common motion of the slices, from which the alignment starts.
         lpips: the metric; None leaves it out.
-        known: alignment of a volume of the same slices in the same poses, which is then taken; found when None.
+        known: alignment to use, of a volume from the same slices in the same poses; None searches for it.
         near: whether the search relies on `truth_from_volume` (`align_rigid`).
     """
     if known is None:
@@ -76,13 +76,13 @@ def scored(
 
 
 def _scaled(fitted: NDArray[np.float64], truth: NDArray[np.float64], scores: Scores) -> NDArray[np.float64]:
-    """A volume as it was given, times the factor that brings it nearest to the truth on the whole grid.
+    """The volume without the fitted offset, times the least-squares factor to the truth on the whole grid.
 
-    No offset: what a method leaves black stays black, as the truth is beside the brain.
+    There is no offset, so that black voxels stay black, as the truth is outside the brain.
 
     Args:
-        fitted: [I, J, K] the volume with gain and offset of the scores, over the data range.
-        truth: [I, J, K] over the data range.
+        fitted: [I, J, K] the volume with gain and offset of the scores, divided by the data range.
+        truth: [I, J, K] divided by the data range.
         scores: in the mask.
     """
     given = fitted - scores.offset / scores.data_range

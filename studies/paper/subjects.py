@@ -1,7 +1,7 @@
 """Subjects of the paper's protocol: heads of 21 to 38 weeks, three orthogonal stacks of 0.8 x 0.8 x 2.2 mm.
 
-The slices have the profile of a short sinc pulse, of all profiles of the simulator the one that is furthest from the
-Gaussian of the model; no setting was chosen on it.
+The slices have the profile of a short sinc pulse. Of all profiles of the simulator it differs most from the Gaussian of
+the model, and no setting was chosen on it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from g3r.evaluation.case import SimulatedCase
 from studies.subjects import SubjectSpec, read_case, simulated_subject
 
 FIRST_SEED, TUNING_SEED = 73_000, 72_000
-"""Of the subjects of the tables, and of those that the baselines were tuned on."""
+"""First seeds of the subjects of the tables, and of the subjects that the baselines were tuned on."""
 
 N_SUBJECTS = 16
 
@@ -40,13 +40,13 @@ class PaperSubject(SubjectSpec):
     weeks: float
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """Stacks as the paper has them, through another profile than the model's."""
+        """Stacks as in the paper, with a profile that differs from the model's."""
         return [replace(one, profile="sinc") for one in super().acquisition(n_stacks)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhantomHead(PaperSubject):
-    """A subject that is made, with a shape and folds of its own."""
+    """A phantom subject, with an individual shape and folds."""
 
     def truth(self, atlas: Path | None) -> TruthVolume:
         """The phantom of its age and seed."""
@@ -54,12 +54,12 @@ class PhantomHead(PaperSubject):
 
 
 def phantom_heads(n: int, motion: str, first_seed: int = FIRST_SEED) -> list[PaperSubject]:
-    """Phantoms with ages spread evenly over 21 to 38 weeks, in an order whose first ones are spread as well.
+    """Phantoms with ages spread evenly over 21 to 38 weeks, in an order in which the first few are spread too.
 
     Args:
-        n: how many.
+        n: number of phantoms.
         motion: level of motion.
-        first_seed: of the first; each has its own.
+        first_seed: seed of the first; each has its own.
     """
     low, high = WEEKS
     ages = low + (high - low) * (np.arange(n) + 0.5) / n
@@ -81,14 +81,14 @@ def atlas_heads(
     """Volumes of an atlas folder between 21 and 38 weeks, by age.
 
     Args:
-        n: at most so many.
+        n: largest number of volumes.
         motion: level of motion.
         atlas: folder of subjects; see `find_subjects`.
-        include: glob patterns of names; none takes all.
-        first_seed: of the first; each has its own.
+        include: glob patterns of names; an empty list takes all.
+        first_seed: seed of the first; each has its own.
 
     Raises:
-        InputError: none is of such an age.
+        InputError: no volume is of such an age.
     """
     aged = sorted((weeks_of(one), one.name) for one in find_subjects(atlas, include))
     found = [(weeks, name) for weeks, name in aged if WEEKS[0] <= weeks <= WEEKS[1]]
@@ -108,7 +108,7 @@ def atlas_heads(
 
 
 def spread_order(n: int) -> list[int]:
-    """Numbers below n in an order in which the first few are far apart: 0, then halves, quarters and so on."""
+    """The numbers below n in an order in which the first few are far apart: 0, then halves, quarters and so on."""
     step = 1 << max(0, (n - 1).bit_length())
     order = [0] if n else []
     while step > 1:
@@ -124,6 +124,6 @@ def paper_case(spec: PaperSubject, atlas: Path | None, cache: Path, n_stacks: in
         spec: the subject.
         atlas: folder of its volume; None for a phantom.
         cache: folder of simulated subjects.
-        n_stacks: its first so many; None for all.
+        n_stacks: number of its first stacks to use; None for all.
     """
     return read_case(simulated_subject(spec, atlas, cache), n_stacks)

@@ -21,7 +21,7 @@ CONDITIONS = (("moderate", 3), ("moderate", 1), ("mild", 3))
 
 
 def rows_of(record: Record, kind: str, **wanted: Any) -> list[Row]:
-    """Rows of a kind that were measured, with these values.
+    """Measured rows of a kind that have the given values.
 
     Args:
         record: of the study.
@@ -56,7 +56,7 @@ def methods_table(rows: Sequence[Row], place: str, why_no_lpips: str) -> str:
     Args:
         rows: of methods.
         place: "mask" or "grid".
-        why_no_lpips: why there is no LPIPS; empty where there is.
+        why_no_lpips: reason why there is no LPIPS; empty if there is.
     """
     named = {name for row in rows for name in row["scores"]}
     names = [name for name in METHODS if name in named] + sorted(named - set(METHODS))
@@ -79,7 +79,7 @@ def subjects(n: int) -> str:
 
 
 def gains(rows: Sequence[Row]) -> str:
-    """By how much the product is above each kind of baseline, in words."""
+    """Gain of the product over each kind of baseline, in words."""
     product = values(rows, PRODUCT, "mask", "psnr_db")
     if not product:
         return ""
@@ -88,7 +88,7 @@ def gains(rows: Sequence[Row]) -> str:
         ("the best volume without a network", NO_NETWORK),
         ("the best unconstrained fit", UNCONSTRAINED),
     ):
-        # those that every subject has: a template fits some heads alone
+        # only baselines that every subject has, because a template fits only some heads
         found = {name: values(rows, name, "mask", "psnr_db") for name in names}
         means = {name: mean(each) for name, each in found.items() if len(each) == len(product)}
         if means:
@@ -105,7 +105,7 @@ def gains(rows: Sequence[Row]) -> str:
 
 
 def main_tables(record: Record) -> str:
-    """Table 1 of every condition: in the mask, then on the whole grid."""
+    """Table 1 for every condition: in the mask, then on the whole grid."""
     parts = []
     for motion, n in CONDITIONS:
         rows = rows_of(record, "methods", motion=motion, n_stacks=n)
@@ -133,7 +133,7 @@ def main_tables(record: Record) -> str:
 
 
 def variants_table(record: Record) -> str:
-    """Fig. 4A in figures."""
+    """Fig. 4A as a table."""
     rows = rows_of(record, "variants")
     if not rows:
         return NOT_YET
@@ -145,7 +145,7 @@ def variants_table(record: Record) -> str:
 
 
 def of_number(rows: Iterable[Row], n_stacks: int) -> list[Row]:
-    """Rows of a number of stacks."""
+    """The rows with a given number of stacks."""
     return [row for row in rows if row["n_stacks"] == n_stacks]
 
 
@@ -155,7 +155,7 @@ def variant_values(rows: Iterable[Row], name: str, n_stacks: int) -> list[float]
     Args:
         rows: of variants.
         name: of the variant.
-        n_stacks: rows of this number alone.
+        n_stacks: only rows with this number of stacks.
     """
     return [float(row["scores"][name]["psnr_db"]) for row in of_number(rows, n_stacks) if name in row["scores"]]
 

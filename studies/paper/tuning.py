@@ -1,4 +1,4 @@
-"""`python -m studies.paper.tuning`: how strong the regularisers of the baselines are, on subjects of no other table."""
+"""`python -m studies.paper.tuning`: strengths of the baselines' regularisers, tuned on subjects of no other table."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STACK_NUMBERS = (3, 1)
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Two subjects, from three stacks and from one."""
+    """Tasks for two subjects, from three stacks and from one."""
     if options.atlas:
         subjects = atlas_heads(2, "moderate", options.atlas, options.volumes, TUNING_SEED)
     else:
@@ -44,11 +44,11 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(spec: PaperSubject, n_stacks: int, atlas: Path | None, cache: Path) -> Row:
-    """PSNR of every kind and strength, in the true poses: the strength is not to make up for wrong ones.
+    """PSNR of every kind and strength, in the true poses, so that the strength does not compensate for pose errors.
 
     Args:
         spec: the subject.
-        n_stacks: its first so many.
+        n_stacks: number of its first stacks to use.
         atlas: of its volume.
         cache: of simulated subjects.
     """
@@ -67,7 +67,7 @@ def measure(spec: PaperSubject, n_stacks: int, atlas: Path | None, cache: Path) 
 
 
 def true_volumes(case: SimulatedCase) -> tuple[InitialVolumes, NDArray[np.float64]]:
-    """What the slices of a case give in their true poses, and their gains [K], matched as in the tables."""
+    """Initial volumes of a case in its true poses, and the gains [K] of its slices, matched as for the tables."""
     slices = normalised_slices(case.stacks)[0]
     row = {key: n for n, key in enumerate(case.true.keys)}
     order = [row[key] for key in zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True)]
@@ -78,7 +78,7 @@ def true_volumes(case: SimulatedCase) -> tuple[InitialVolumes, NDArray[np.float6
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Mean PSNR by strength; the best is marked."""
+    """Table of the mean PSNR by strength; the best is marked."""
     lines = []
     for n in STACK_NUMBERS:
         rows = [row for row in record["rows"].values() if row["n_stacks"] == n]

@@ -1,8 +1,8 @@
-"""A baseline: Gaussians fitted to the slices alone, as GSVR does it, without prior volume and without stage 1.
+"""Baseline: Gaussians fitted to the slices alone, as in GSVR, without prior volume and without stage 1.
 
-Seeds at random, or where the scattered volume changes most; round ones, as bright as that volume; then Adam on
-Gaussians, poses and gains with the L1 loss over the masked pixels. The renderer and the profile of the slices are
-those of the product, the amplitude is as Eq. 5 prints it or exact.
+Isotropic Gaussians are seeded at random, or where V_coarse changes most, with the intensity of V_coarse. Then Adam fits
+Gaussians, poses and gains with the L1 loss over the masked pixels. The renderer and the slice profile are those of the
+product; the attenuation is as printed in Eq. 5 or exact.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes, render
 from g3r.gaussians.seeding import SCALE_PER_SPACING
 
 OVERLAP_MARGIN_SIGMA = 1.0
-"""Lists of Gaussians and planes are made this much larger, and are good for some steps."""
+"""Margin of the overlap lists, which keeps them valid for several steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unconstrained:
-    """How the fit is made.
+    """Settings of the unconstrained fit.
 
     Args:
-        attenuation: "printed" for Eq. 5 as it is printed, "exact".
-        seeding: "random" in the foreground, or "gradient": more where V_coarse changes.
+        attenuation: "printed" for Eq. 5 as printed, or "exact".
+        seeding: "random" in the foreground, or "gradient": denser where V_coarse changes.
         n_steps: of Adam.
-        steps_per_list: steps between two lists of which Gaussians a plane sees.
+        steps_per_list: steps between two updates of the overlap list.
     """
 
     attenuation: str = "exact"
@@ -57,10 +57,10 @@ def fit_unconstrained(
     """The Gaussians that fit the slices best.
 
     Args:
-        volumes: of the slices in their poses.
-        gain: [K] intensity factors to start from.
+        volumes: initial volumes of the posed slices.
+        gain: [K] initial intensity factors.
         weight: [K] slice weights.
-        spacing_mm: cube root of the volume per Gaussian; as many as the product's fit has.
+        spacing_mm: cube root of the volume per Gaussian, as in the product's fit.
         settings: seeds, amplitudes, steps.
         rng: draws the seeds.
         widths: of each stack's profile through the plane, see `SliceModel.applied`.
@@ -81,7 +81,7 @@ def fit_unconstrained(
     groups += [{"params": [log_gain], "lr": rates.log_gain}, {"params": [twist], "lr": rates.rotation_rad}]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first = [group["lr"] for group in adam.param_groups]
-    # a step of the twist is in rad and in mm: the second half of it is longer
+    # a twist has rotations in rad and translations in mm, which need longer steps
     unit = torch.tensor([1.0] * 3 + [rates.translation_mm / rates.rotation_rad] * 3)
     overlaps: OverlapList | None = None
     for step in range(settings.n_steps):
@@ -102,10 +102,10 @@ def fit_unconstrained(
 
 
 def seeds(volumes: InitialVolumes, spacing_mm: float, seeding: str, rng: np.random.Generator) -> GaussianCloud:
-    """Round Gaussians at random voxels of the foreground, as bright as V_coarse there.
+    """Isotropic Gaussians at random voxels of the foreground, with the intensity of V_coarse there.
 
     Args:
-        volumes: of the slices.
+        volumes: initial volumes of the slices.
         spacing_mm: cube root of the volume per Gaussian.
         seeding: see `Unconstrained`.
         rng: draws the voxels.

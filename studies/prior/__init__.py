@@ -1,1 +1,1 @@
-"""The prior measured: the tables of docs/prior.md."""
+"""Accuracy of the prior: the tables of docs/prior.md."""

@@ -1,4 +1,4 @@
-"""`python -m studies.prior.ablation`: what the prior brings to the fit, by the number of stacks."""
+"""`python -m studies.prior.ablation`: gain of the fit by the prior, by number of stacks."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ VOLUMES = (
     "spina-bifida/sb31-operated",
     "spina-bifida/sb33-operated",
 )
-"""None was trained on. Weeks 24, 30 and 34 were used for nothing at all, but their neighbours were trained
-on; the operated volumes are another atlas, whose volumes before operation were trained on, and checkpoints
-were chosen by operated ones."""
+"""Volumes that were not used for training. Weeks 24, 30 and 34 were used for nothing at all, but neighbouring weeks
+were trained on. The operated volumes belong to another atlas, whose volumes before operation were trained on;
+checkpoints were chosen on operated volumes."""
 
 GROUPS = {"sta": "crl-sta/", "sb": "spina-bifida/"}
 
 FIRST_SEED, DEVELOPMENT_SEED = 52_000, 51_000
-"""Seeds from the first belong to the published table; from the second they may be looked at before."""
+"""First seeds of the published table, and of subjects that may be looked at during development."""
 
 MOTION = "mild"
 STACK_NUMBERS = (1, 2, 3)
@@ -49,7 +49,7 @@ FITS_COMPARED: dict[str, Mapping[str, Any]] = {
 """Variants of the fit, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
 
 VARIANTS = ("V_coarse", "V_sharp", "prior alone", *FITS_COMPARED)
-"""In the order of the table."""
+"""All variants in the order of the table."""
 
 
 def specs(*, development: bool = False) -> list[SubjectSpec]:
@@ -59,7 +59,7 @@ def specs(*, development: bool = False) -> list[SubjectSpec]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every subject from every number of stacks; the longest first, so that workers end together."""
+    """One task per subject and number of stacks, the longest first, so that workers finish at the same time."""
     chosen = [s for s in specs(development=options.development) if any(word in s.name for word in options.subjects)]
     for n in sorted(options.stacks, reverse=True):
         for spec in chosen:
@@ -79,7 +79,7 @@ def measure_subject(spec: SubjectSpec, n_stacks: int, options: argparse.Namespac
 
 
 def measure(case: SimulatedCase, options: argparse.Namespace) -> Row:
-    """Scores of every variant of one subject, after one registration that all of them share."""
+    """Scores of every variant of one subject, after one common registration."""
     settings, ckpt = PRESETS[options.preset], options.ckpt
     start = time.perf_counter()
     motion = GaussianReconstructor(ckpt, settings).register_stacks(case.stacks)
@@ -94,7 +94,7 @@ def measure(case: SimulatedCase, options: argparse.Namespace) -> Row:
         tre[name] = error.median_mm
         volumes = {name: (result.volume, result.grid)}
         if name == BASELINE:
-            # what replaces a prior
+            # the volume that is used in place of a prior
             volumes |= {"V_coarse": (result.coarse, result.prior_grid), "V_sharp": (result.prior, result.prior_grid)}
         elif name == VARIANTS[-1]:
             volumes["prior alone"] = result.prior, result.prior_grid
@@ -103,13 +103,13 @@ def measure(case: SimulatedCase, options: argparse.Namespace) -> Row:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished measurement."""
+    """Progress line of a finished measurement."""
     listed = ", ".join(f"{variant} {row['scores'][variant]['psnr_db']:.2f}" for variant in VARIANTS)
     return f"{key}: {listed} dB, {sum(row['seconds'].values()):.0f} s"
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Mean and spread of each variant for all subjects and by atlas; then every subject."""
+    """Tables of mean and spread of each variant for all subjects and by atlas; then of every subject."""
     rows = sorted(record["rows"].values(), key=lambda row: (row["subject"], row["n_stacks"]))
     numbers = sorted({row["n_stacks"] for row in rows})
     of_group = {group: [row for row in rows if row["volume"].startswith(prefix)] for group, prefix in GROUPS.items()}
@@ -159,12 +159,12 @@ def _columns(n: int) -> list[tuple[str, Any]]:
 
 
 def differences_db(rows: Sequence[Row], variant: str, n_stacks: int) -> list[float]:
-    """By how much a variant is better than the fit without prior, subject by subject.
+    """PSNR differences of a variant to the fit without prior, subject by subject.
 
     Args:
         rows: of the record.
         variant: one of `VARIANTS`.
-        n_stacks: rows of this number alone.
+        n_stacks: only rows with this number of stacks.
     """
     pairs = zip(values(rows, variant, n_stacks, "psnr_db"), values(rows, BASELINE, n_stacks, "psnr_db"), strict=True)
     return [one - other for one, other in pairs]

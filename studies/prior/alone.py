@@ -20,20 +20,20 @@ from studies.subjects import SubjectSpec, case_folders, read_case, simulated_cas
 from studies.tables import Cell, marked, stacks, table
 
 WANTED_GAIN_DB = {1: 3.0, 3: 2.0}
-"""How much better than V_coarse the prior should be, by number of stacks."""
+"""Required gain of the prior over V_coarse, by number of stacks."""
 
 WANTED_SSIM = {1: 0.80, 3: 0.85}
 
 SPEED_VOLUME, SPEED_SEED = "crl-sta/sta36", 52_990
-"""The head on which seconds are measured: 36 weeks, three stacks."""
+"""Head on which seconds are measured: 36 weeks, three stacks."""
 
 SPEED = "speed"
-"""Key of that row."""
+"""Key of the row of seconds."""
 
 WANTED_SECONDS = 5.0
 WANTED_TILING_DIFFERENCE = 1e-3
 TILE_VOXELS = 72
-"""Edge of the tiles of that check: small enough that a head is cut in all directions."""
+"""Edge of the tiles in the check of tiling, small enough that a head is cut in all directions."""
 
 REPEATS = 3
 
@@ -41,7 +41,7 @@ VOLUMES = ("V_coarse", "V_sharp", "V_prior")
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every case from its first stack and from all; then the seconds."""
+    """Tasks for every case from its first stack and from all stacks; then one for the seconds."""
     for folder in case_folders(options.cases):
         for n_stacks in sorted({1, len(list(folder.glob("stack-*.nii.gz")))}):
             yield Task(f"{folder.name}, {stacks(n_stacks)}", measure, (folder, n_stacks, options))
@@ -50,7 +50,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
-    """Scores of each volume of the first `n_stacks` stacks; poses are true, so nothing is aligned.
+    """Scores of each volume of the first `n_stacks` stacks at true poses, which need no alignment.
 
     Args:
         folder: of the case.
@@ -70,7 +70,7 @@ def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
 
 
 def measure_speed(options: argparse.Namespace) -> Row:
-    """Wall seconds on a 36-week brain (the least of a few runs), and what tiles change."""
+    """Wall seconds on a 36-week brain (the minimum of a few runs), and the difference made by tiles."""
     prior = Prior.load(options.ckpt)
     spec = SubjectSpec(name="speed-sta36", volume=SPEED_VOLUME, motion="mild", seed=SPEED_SEED, stretch=0.0)
     case = simulated_case(spec, options.cache)
@@ -89,12 +89,12 @@ def measure_speed(options: argparse.Namespace) -> Row:
 
 
 def gain_db(row: Mapping[str, Any]) -> float:
-    """By how much the prior is better than V_coarse."""
+    """Gain of the prior over V_coarse."""
     return float(row["scores"]["V_prior"]["psnr_db"] - row["scores"]["V_coarse"]["psnr_db"])
 
 
 def line(key: str, row: Row) -> str:
-    """A finished measurement."""
+    """Progress line of a finished measurement."""
     if key == SPEED:
         return f"{key}: {row['seconds']['V_prior']:.1f} s"
     scores = ", ".join(f"{name} {row['scores'][name]['psnr_db']:.2f} dB" for name in VOLUMES)
@@ -111,7 +111,7 @@ def _ssim(row: Row) -> str:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """The table, with what was asked and whether it is reached, and a line about seconds."""
+    """The table with the required gains and whether they are reached, and a line about seconds."""
     rows = [row for key, row in record["rows"].items() if key != SPEED]
     columns: dict[str, Cell] = {
         "case": "{case}",

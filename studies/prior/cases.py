@@ -1,4 +1,4 @@
-"""`python -m studies.prior.cases`: with and without the prior on the cases of the test data."""
+"""`python -m studies.prior.cases`: reconstruction with and without the prior on the cases of the test data."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from studies.subjects import case_folders, read_case
 from studies.tables import Cell, marked, table
 
 MAX_LOSS_DB = 0.1
-"""From several stacks the prior may not cost more than this."""
+"""Largest accepted loss by the prior from several stacks."""
 
 PRODUCT = VARIANTS[-1]
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case."""
+    """One task per case."""
     for folder in case_folders(options.cases):
         yield Task(folder.name, measure_case, (folder, options))
 
 
 def measure_case(folder: Path, options: argparse.Namespace) -> Row:
-    """Every variant on one case, with all its stacks."""
+    """Measure every variant on one case with all its stacks."""
     case = read_case(folder)
     return {"n_stacks": len(case.stacks), **measure(case, options)}
 
@@ -37,7 +37,7 @@ def gain(row: Row) -> str:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A row per case: dB of every variant, what the prior brings, median TRE."""
+    """A row per case: dB of every variant, gain by the prior, median TRE."""
     columns: dict[str, Cell] = {
         "case": "{case}",
         "stacks": "{n_stacks}",

@@ -1,4 +1,4 @@
-"""Figures of the studies of the prior."""
+"""Figures of the prior studies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from studies.tables import new_figure, save_figure, stacks
 
 COLOURS = ("#9a9a9a", "#c58a3a", "#2f9e6e", "#4a4a4a", "#5b8fd6", "#c0392b", "#8e5bb5", "#17a2b8")
 SIDEWAYS = 0.05
-"""Sideways distance between the points of different lines, in numbers of stacks."""
+"""Horizontal offset between the points of different lines, in numbers of stacks."""
 
 
 def draw_ablation(rows: Sequence[Mapping[str, Any]], variants: Sequence[str], baseline: str, path: Path) -> None:
@@ -21,8 +21,8 @@ def draw_ablation(rows: Sequence[Mapping[str, Any]], variants: Sequence[str], ba
     Args:
         rows: `n_stacks` and `scores` -> variant -> `psnr_db`, `ssim`.
         variants: lines, in the order of the legend.
-        baseline: what the paired differences are taken to.
-        path: PNG to write, whole or not at all.
+        baseline: variant from which the paired differences are taken.
+        path: PNG to write, atomically.
     """
     numbers = sorted({row["n_stacks"] for row in rows})
     figure = new_figure((13, 4.2))
@@ -69,11 +69,11 @@ def draw_ablation(rows: Sequence[Mapping[str, Any]], variants: Sequence[str], ba
 
 
 def draw_networks(record: Mapping[str, Any], path: Path) -> None:
-    """Gain of each variant over V_coarse by the number of stacks, and error against seconds for the sizes.
+    """Draw the gain of each variant over V_coarse by the number of stacks, and error against seconds for the sizes.
 
     Args:
         record: of `studies.prior.networks`.
-        path: PNG to write, whole or not at all.
+        path: PNG to write, atomically.
     """
     scores = {name: row["scores"] for name, row in record["rows"].items()}
     coarse = scores.pop("V_coarse")

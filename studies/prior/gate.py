@@ -1,4 +1,4 @@
-"""`python -m studies.prior.gate`: does the density help the prior network, as its input and as its gate?"""
+"""`python -m studies.prior.gate`: value of the density for the prior network, as an input and in the gate."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 SEEDS = (1, 2, 3)
 KINDS = {"coverage": "whole slices", "masked": "masked pixels", "printed": "as printed, 1/mm"}
-"""Definitions of M_rho by their names in `g3r.training.prior_batches.DENSITY_KINDS`, in words."""
+"""Definitions of M_rho in words, by their names in `g3r.training.prior_batches.DENSITY_KINDS`."""
 
 
 def variants() -> list[tuple[str, Variant]]:
-    """The factorial: kind of the density and network; where neither F nor gate reads it, the kind does not matter."""
+    """The factorial design of density kind and network; without density in F and gate there is only one kind."""
     found = []
     for kind in KINDS:
         for in_f, gated in ((True, True), (True, False), (False, True)):
@@ -42,7 +42,10 @@ def settings(options: argparse.Namespace) -> Record:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """What the network starts from, and every variant with every seed; seeds in turn, so that a part is a whole."""
+    """Tasks for the baselines and for every variant with every seed, one seed after the other.
+
+    An interrupted study then has all variants for its first seeds.
+    """
     data = (options.source or data_folder("atlas"), options.cache, options.val_subjects)
     for name in (*BASELINES, "base"):
         yield Task(name, baseline, (name, data))
@@ -52,10 +55,10 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
-    """Scores of a volume that the network starts from.
+    """Scores of one input volume of the network.
 
     Args:
-        name: of `BASELINES`, or "base" for what the residual is added to.
+        name: of `BASELINES`, or "base" for the volume to which the residual is added.
         data: the first three arguments of `validation_volumes`.
     """
     from g3r.prior.config import PriorNetworkConfig
@@ -70,12 +73,12 @@ def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
 def measure(
     kind: str, variant: Variant, seed: int, data: tuple[Path, Path, int], options: argparse.Namespace
 ) -> Row | None:
-    """Train and score one variant; None where the training failed.
+    """Train and score one variant; None if the training failed.
 
     Args:
         kind: of the density.
         variant: of the network.
-        seed: of its weights, and of the symmetries of the patches.
+        seed: of its weights and of the random symmetry operations on patches.
         data: the first three arguments of `validation_volumes`.
         options: of the command.
     """
@@ -99,7 +102,7 @@ def measure(
 
 
 def estimated(checkpoint: Path, kind: str, volumes: Sequence[Mapping[str, Tensor]]) -> tuple[list[Tensor], int]:
-    """V_prior of some volumes by a network that cannot be exported, and the steps of its training.
+    """V_prior of volumes from a network that cannot be exported, and the number of its training steps.
 
     Args:
         checkpoint: of the training.
@@ -131,7 +134,7 @@ def scores(made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]) -> d
 
     from g3r.training.prior_validation import VALIDATED, ValidationScores, psnr_by_bin, validation_means
 
-    kept = ValidationScores(voxel_mm=1.0)  # rim and depth are pooled, whatever the size
+    kept = ValidationScores(voxel_mm=1.0)  # any size will do, since rim and depth are pooled
     for volume, one in zip(made, volumes, strict=True):
         inside = (one["mask"] > 0.5).to(torch.float32)
         kept.add({name: volume for name in VALIDATED}, one, inside)

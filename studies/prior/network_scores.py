@@ -1,4 +1,4 @@
-"""How trained variants of the prior network are compared: errors by number of stacks, seconds, size."""
+"""Comparison of trained variants of the prior network: errors by number of stacks, seconds, size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 LEFT_OUT = ("sta24", "sta30", "sta34")
 VALIDATED_ON = ("*-operated",)
-"""Subjects of the atlas: the first are for judging, the second choose, the rest train."""
+"""Atlas subjects of the trainings: LEFT_OUT are for testing, VALIDATED_ON choose checkpoints, the others train."""
 
 SPEED_SHAPE = (129, 152, 130)
 """Voxels of a 36-week brain at 0.8 mm with its margin (`studies.prior.alone`)."""
@@ -35,7 +35,7 @@ BASELINES = {"V_coarse": "coarse", "V_sharp": "sharp"}
 
 @functools.cache
 def validation_volumes(source: Path, cache: Path, val_subjects: int, config: Path) -> list[dict[str, Tensor]]:
-    """The volumes that every variant is compared on: those that its training validated on.
+    """The volumes on which all variants are compared: the validation volumes of their training.
 
     Args:
         source: folder of the atlas.
@@ -88,7 +88,7 @@ def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]
 
 
 def inference_seconds(exported: Path) -> float:
-    """Wall seconds of one view of a whole brain, the least of a few runs."""
+    """Wall seconds of one view of a whole brain, the minimum of a few runs."""
     import numpy as np
 
     from g3r.prior.maps import PriorMaps

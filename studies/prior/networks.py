@@ -1,4 +1,4 @@
-"""`python -m studies.prior.networks`: variants of the prior network, trained alike and compared."""
+"""`python -m studies.prior.networks`: comparison of variants of the prior network after the same training."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ NAMES = tuple(variant.name for variant in VARIANTS)
 
 
 def settings(options: argparse.Namespace) -> Record:
-    """Settings that all variants share; a later table reads them from the record."""
+    """Common settings of all variants; a later table reads them from the record."""
     if options.no_train:
         return {}
     epochs = epochs_of(options.steps, configuration(), options.train_args)
@@ -55,7 +55,7 @@ def settings(options: argparse.Namespace) -> Record:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """The inputs of the network and the variants."""
+    """Tasks for the inputs of the network and for the variants."""
     if options.no_train:
         return
     config = configuration()
@@ -70,7 +70,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
-    """Scores of one of the volumes that the network starts from."""
+    """Scores of one input volume of the network."""
     volumes = validation_volumes(*data, CONFIG)
     return {"scores": scores_by_stacks([one[BASELINES[name]] for one in volumes], volumes)}
 
@@ -104,7 +104,7 @@ def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], optio
 
 
 def finish(record: Record, options: argparse.Namespace) -> None:
-    """Measure the seconds of all variants again, if asked."""
+    """Measure the seconds of all variants again, if requested."""
     if options.retime:
         record |= {"threads": options.threads or available_cores(), "machine": machine()}
         for name, row in record["rows"].items():
@@ -113,7 +113,7 @@ def finish(record: Record, options: argparse.Namespace) -> None:
 
 
 def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
-    """The variants, without a size that is the configuration's own."""
+    """The variants, without one whose size equals that of the configuration."""
     network = config["model"]["init_args"]["network"]
     model = {**asdict(PriorNetworkConfig()), **network}
     return [
@@ -124,7 +124,7 @@ def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A row per variant, those it starts from first.
+    """A row per variant, after rows for the inputs of the network.
 
     Raises:
         InputError: no variant has been trained.
@@ -155,7 +155,7 @@ def tables(record: Record) -> dict[str, str]:
 
 
 def _psnr(n: str) -> Cell:
-    # no format: in its brackets a number is the place in a list
+    # not a format, which reads a number in brackets as a list index
     return lambda row: f"{row['scores'][n]['psnr_db']:.2f}" if n in row["scores"] else ""
 
 

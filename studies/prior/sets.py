@@ -1,4 +1,4 @@
-"""`python -m studies.prior.sets`: what the weights trained on data in the public domain alone cost."""
+"""`python -m studies.prior.sets`: loss with the weights that were trained only on data in the public domain."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SETS: dict[str, str | None] = {USUAL: None, **{name: name for name in SET_NAMES}
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every case as it is, and with its holes if it has any, with each set of weights."""
+    """One task per case and set of weights: the complete stacks, and those with the holes of the case, if any."""
     for folder in case_folders(options.cases):
         subjects: list[tuple[str, int | None, tuple[Hole, ...]]] = [(folder.name, None, ())]
         subjects += [
@@ -42,14 +42,14 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 def measure(
     name: str, set_name: str, folder: Path, n_stacks: int | None, holes: tuple[Hole, ...], options: argparse.Namespace
 ) -> Row:
-    """One case with one set of weights.
+    """Measure one case with one set of weights.
 
     Args:
-        name: of the case, with what it misses.
+        name: of the case, with its holes.
         set_name: of `SETS`.
         folder: of the case.
-        n_stacks: that are used; None takes all.
-        holes: what they miss.
+        n_stacks: number of stacks to use; None takes all.
+        holes: missing slices.
         options: of the command.
     """
     case = read_case(folder, n_stacks)
@@ -72,7 +72,7 @@ def measure(
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A row per case, all sets side by side, and their mean."""
+    """A row per case with all sets side by side, and the mean."""
     by_case: dict[str, dict[str, Row]] = {}
     for row in record["rows"].values():
         by_case.setdefault(row["case"], {})[row["set"]] = row

@@ -1,4 +1,4 @@
-"""Short trainings of variants of the prior network, in processes of their own, alike but for what is compared."""
+"""Short trainings of variants of the prior network, each in its own process, with the same settings otherwise."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Variant:
 
 
 def configuration() -> dict[str, Any]:
-    """The training that the variants differ from."""
+    """The configuration of the training from which the variants differ."""
     return dict(yaml.safe_load(CONFIG.read_text(encoding="utf-8")))
 
 
@@ -48,7 +48,7 @@ def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = 
     Args:
         steps: of the optimiser.
         config: of the training.
-        arguments: that may change the size of an epoch, such as `--data.batch_size=2`.
+        arguments: further arguments, which may change the size of an epoch, such as `--data.batch_size=2`.
     """
     data = dict(config["data"]["init_args"])
     for argument in arguments:
@@ -76,7 +76,7 @@ def train(
     """Train a variant in a process of its own, going on where an earlier one stopped unless `fresh`.
 
     Returns:
-        Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.
+        Its last checkpoint, or None if the training failed (`train.log` holds the reason), and wall seconds.
     """
     if fresh:  # an earlier training may be finished, and of other code
         shutil.rmtree(run, ignore_errors=True)

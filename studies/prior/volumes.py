@@ -1,4 +1,4 @@
-"""The volumes that lead to a prior (coarse, sharp, prior) of a simulated subject."""
+"""Coarse, sharp and prior volume of a simulated subject."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from g3r.prior.model import Prior
 from g3r.prior.subject_template import PlacedTemplate
 
 MARGIN_MM = 5.0
-"""Around the slices, as the reconstruction has it."""
+"""Margin around the slices, as in the reconstruction."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class PriorVolumes:
 
     Attributes:
         by_name: `V_coarse` (Eq. 6), `V_sharp` and `V_prior` (Eq. 7).
-        maps: what the network was given.
-        grid: of all of them.
+        maps: inputs of the network.
+        grid: of all volumes.
         seconds: wall time of each step.
     """
 
@@ -49,7 +49,7 @@ class PriorVolumes:
 
 
 def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
-    """The first stacks' slices where they were truly taken; slices of unknown pose are excluded."""
+    """The slices of the first stacks at their true poses, without slices of unknown pose."""
     slices = slices_from_stacks(case.stacks[:n_stacks])
     row_of = {key: row for row, key in enumerate(case.true.keys)}
     keys = list(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))
@@ -60,14 +60,14 @@ def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
 
 
 def template_at_truth(template: AtlasTemplate, truth: Volume, mask: NDArray[np.bool_]) -> PlacedTemplate:
-    """The atlas head that is nearest in size, enlarged to the true one's volume and put at its centre.
+    """The template of the most similar size, scaled to the volume of the true head and placed at its centre.
 
-    Slices at their true poses lie in the frame of the truth, whose axes are those of the atlas.
+    Slices at their true poses are in the frame of the truth, which has the axes of the atlas frame.
 
     Args:
         template: of a `Prior`.
         truth: the volume that was sliced.
-        mask: [I, J, K] of it.
+        mask: [I, J, K] of the truth.
     """
     here_mm3 = mask.sum() * truth.grid.voxel_volume_mm3
     there_mm3 = (template.volume > 0).sum((1, 2, 3)) * template.grid.voxel_volume_mm3
@@ -80,12 +80,12 @@ def template_at_truth(template: AtlasTemplate, truth: Volume, mask: NDArray[np.b
 
 
 def prior_volumes(prior: Prior, slices: Slices, placed: PlacedTemplate | None, n_views: int = 1) -> PriorVolumes:
-    """V_coarse, M_rho, V_sharp and V_prior of slices in the poses that they have.
+    """V_coarse, M_rho, V_sharp and V_prior of slices in their given poses.
 
     Args:
         prior: network and voxel size.
         slices: posed.
-        placed: the prior's template at the head; None takes the smooth continuation in its place.
+        placed: the prior's template at the head; None takes the smooth continuation instead.
         n_views: see `estimate_prior`.
     """
     seconds: dict[str, float] = {}
@@ -107,11 +107,11 @@ def prior_volumes(prior: Prior, slices: Slices, placed: PlacedTemplate | None, n
 
 
 def tiling_difference(prior: Prior, volumes: PriorVolumes, tile_voxels: int) -> float:
-    """Largest difference, in the normalised scale, between a prior of one view made whole and in tiles.
+    """Largest difference, in normalised intensities, between a prior (one view) computed whole and in tiles.
 
     Args:
         prior: the network.
-        volumes: made whole.
+        volumes: computed whole.
         tile_voxels: edge of a tile.
     """
     tiled = prior.estimate(volumes.maps, tiling=Tiling(0, tile_voxels)).volume

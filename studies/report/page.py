@@ -19,13 +19,13 @@ from tests.report.browser import browser, chromium
 CASE = "--phantom 30 --motion moderate --resolution 1.0 --thickness 3.0 --seed 1 --force --output"
 
 WIDTH, HEIGHT = 900, 1005
-"""Of the window in pixels: verdict and viewer."""
+"""Size of the browser window in pixels, which shows verdict and viewer."""
 
 COLORS = 128
 
 
 def photograph(page: Path) -> Image.Image:
-    """What a browser shows of the upper part of a page, in few colours."""
+    """Screenshot of the upper part of a page, with a reduced palette."""
     with tempfile.TemporaryDirectory() as profile, browser(Path(profile)) as window:
         window.open(page, WIDTH, HEIGHT)
         return window.picture().quantize(COLORS)

@@ -1,1 +1,1 @@
-"""What docs/results.md shows: every published table of docs/, and what becomes of the claims of g3r and the paper."""
+"""The page docs/results.md: all published tables of docs/, and the outcome of the claims of g3r and the paper."""

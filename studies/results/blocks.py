@@ -11,10 +11,10 @@ from pathlib import Path
 from studies.harness import DOCS
 
 PAGE = "results.md"
-"""The page that is made of all others."""
+"""The page that is generated from all others."""
 
 NO_MEASUREMENT = {"messages", "paper-elsewhere"}
-"""A list of what the program says, and rows that stand in another page."""
+"""Blocks without measurements: a list of the program's messages, and rows that repeat another page."""
 
 RECORD_OF = {
     "paper-variants": "paper-methods",
@@ -22,24 +22,14 @@ RECORD_OF = {
     "paper-stages": "paper-methods",
     "paper-stages-atlas": "paper-methods-atlas",
 }
-"""Blocks of the same record as another one, which is the one that its page says the command of."""
+"""Blocks that come from the record of another block, which is the block whose command the page states."""
 
 OLDER_WEIGHTS = frozenset(
-    {
-        *(
-            "sets",
-            "unseen-sweep",
-            "masks-written",
-            "paper-variants-atlas",
-            "paper-stages-atlas",
-            "lattices",
-            "in-plane",
-        ),
-        *("time-budgets", "bias", "convergence", "layers", "intensities", "slice-profile"),
-    }
+    "sets unseen-sweep masks-written paper-variants-atlas paper-stages-atlas lattices in-plane time-budgets bias "
+    "convergence layers intensities slice-profile".split()
 )
-"""Blocks of runs with a prior that do not say its weights, from commits before that of the present ones (bc1df76). What
-is published anew says them."""
+"""Blocks measured with earlier weights of the prior, before commit bc1df76, that do not name them. Blocks published
+since then do."""
 
 BLOCK = re.compile(r"<!-- ([\w.-]+):begin -->\n(.*?)\n?<!-- \1:end -->", flags=re.DOTALL)
 COMMAND = re.compile(
@@ -59,8 +49,8 @@ class Table:
     """A table in Markdown.
 
     Attributes:
-        text: as it stands there.
-        before: the text of the block between the table before it and this one.
+        text: of the table.
+        before: text of the block between the previous table and this one.
     """
 
     text: str
@@ -68,24 +58,24 @@ class Table:
 
     @cached_property
     def rows(self) -> tuple[TableRow, ...]:
-        """Cells by the head of their column; of columns with one name the later ones get a number."""
+        """Cells by column heading; repeated headings get a number."""
         lines = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in self.text.splitlines()]
         heads = [head if head not in lines[0][:n] else f"{head} {n}" for n, head in enumerate(lines[0])]
         return tuple(dict(zip(heads, line, strict=True)) for line in lines[2:])
 
     def row(self, name: str) -> TableRow | None:
-        """The row whose first cell is this."""
+        """The row whose first cell is `name`."""
         return next((row for row in self.rows if next(iter(row.values())) == name), None)
 
 
 @dataclass(frozen=True)
 class Block:
-    """What a study has published.
+    """A published block of a study.
 
     Attributes:
         name: of its markers.
         page: file in docs/.
-        command: that measures it; empty where the page says none.
+        command: command that measures it; empty if the page states none.
         text: between the markers.
     """
 
@@ -105,24 +95,24 @@ class Block:
 
     @property
     def commit(self) -> str:
-        """Of the measurement; empty where the block does not say it."""
+        """Commit of the measurement; empty if the block does not state it."""
         found = COMMIT.findall(self.text)
         return found[-1] if found else ""
 
     @property
     def machine(self) -> str:
-        """Processor, cores and threads; empty where the block does not say them."""
+        """Processor, cores and threads; empty if the block does not state them."""
         found = MACHINE.search(self.text)
         return found[0].split(";")[0].strip() if found else ""
 
     @property
     def weights(self) -> str:
-        """Of the prior; empty where the block does not say them."""
+        """Weights of the prior; empty if the block does not state them."""
         found = WEIGHTS.search(self.text)
         return found[1] if found else ""
 
     def is_older(self, shipped: str) -> bool:
-        """Whether it was measured with other weights than those."""
+        """Whether it was measured with weights other than `shipped`."""
         return self.weights != shipped if self.weights else self.name in OLDER_WEIGHTS
 
     @property
@@ -132,10 +122,10 @@ class Block:
 
 
 def published(docs: Path = DOCS) -> dict[str, Block]:
-    """Every block of the pages, by its name.
+    """Every block of the pages, by name.
 
     Raises:
-        ValueError: two pages have a block of one name.
+        ValueError: two pages have a block of the same name.
     """
     found: dict[str, Block] = {}
     for path in sorted(docs.glob("*.md")):
@@ -152,14 +142,14 @@ def published(docs: Path = DOCS) -> dict[str, Block]:
 
 
 def _command(above: str) -> str:
-    """The last command of a text; empty where there is none."""
+    """The last command in a text; empty if there is none."""
     whole = BLOCK.sub("", re.sub(r"\s*\\\n\s*", " ", above))
     commands = [indented or inline for indented, inline in COMMAND.findall(whole)]
     return commands[-1].split("  #")[0].strip() if commands else ""
 
 
 def origin(name: str, blocks: Mapping[str, Block]) -> Block:
-    """The block that says on which machine and commit a block was measured: itself, or one of the same record.
+    """The block that states machine and commit of a block: itself, or another block of the same record.
 
     Args:
         name: of the block.

@@ -1,4 +1,4 @@
-"""What a claim is, and how one is decided: from figures of published tables, and never from fewer than are needed."""
+"""Claims and their decision: from figures of published tables, and only if enough subjects were measured."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from studies.results.blocks import Block, Table, TableRow, number
 HOLDS, FAILS, UNSAID, MISSING = "holds", "does not hold", "cannot be said", "not measured"
 
 NOTICEABLE_DB = 0.1
-"""A part that brings less does not help."""
+"""Least gain that counts; a part with less does not help."""
 
 FEW = 4
-"""Fewer subjects, or cases, say nothing in general."""
+"""Least number of subjects or cases for a general statement."""
 
 FEW_RUNS = 20
-"""Fewer runs cannot show a share of 95 %."""
+"""Least number of runs that can show a share of 95 %."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What was measured about a claim.
+    """Measurement that decides a claim.
 
     Attributes:
         figure: as text.
-        n: how many were measured.
-        of: what, such as "subjects".
+        n: number of measurements.
+        of: measured things, such as "subjects".
         holds: whether the figure is as claimed.
-        enough: whether so many can show it.
+        enough: whether `n` is enough to decide the claim.
     """
 
     figure: str
@@ -40,26 +40,26 @@ class Finding:
 
     @property
     def outcome(self) -> str:
-        """In two or three words."""
+        """Outcome in two or three words."""
         if not self.enough:
             return UNSAID
         return HOLDS if self.holds else FAILS
 
     @property
     def counted(self) -> str:
-        """How many were measured, in words: "1 subject", "3 subjects"."""
+        """Number of measurements in words: "1 subject", "3 subjects"."""
         return f"{self.n} {self.of.removesuffix('s') if self.n == 1 else self.of}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """Something that is said of g3r or in the paper.
+    """A claim about g3r or in the paper.
 
     Attributes:
         text: the claim.
-        asked: when it holds; and who asked for that, or what the paper says.
+        asked: criterion by which it holds, with its source or the paper's figure.
         block: the published block with the figure.
-        find: the finding, from the block; None where the block has no such figure.
+        find: function that returns the finding from the block; None if the block has no such figure.
         yes, no: the conclusion if it holds and if it does not; "{figure}" becomes the figure.
     """
 
@@ -73,12 +73,12 @@ class Claim:
 
 @dataclass(frozen=True)
 class Judged:
-    """A claim with what was found.
+    """A claim with its finding.
 
     Attributes:
         claim: that was judged.
-        finding: None where nothing was measured.
-        older: its table is of other weights than those that are shipped.
+        finding: None if nothing was measured.
+        older: whether its table was measured with weights other than the shipped ones.
     """
 
     claim: Claim
@@ -87,24 +87,24 @@ class Judged:
 
     @property
     def outcome(self) -> str:
-        """In two or three words."""
+        """Outcome in two or three words."""
         return self.finding.outcome if self.finding else MISSING
 
     @property
     def so_far(self) -> str:
-        """What it looks like where there are too few; empty where there are enough, or none."""
+        """Preliminary outcome if there are too few measurements; empty if there are enough or none."""
         if self.finding is None or self.finding.enough:
             return ""
         return f"so far it {HOLDS if self.finding.holds else FAILS}"
 
     @property
     def verdict(self) -> str:
-        """The outcome, and what it looks like so far."""
+        """The outcome, with the preliminary one if there is one."""
         return f"{self.outcome} (n too small; {self.so_far})" if self.so_far else self.outcome
 
     @property
     def conclusion(self) -> str:
-        """In plain words."""
+        """Conclusion in plain words."""
         if self.finding is None:
             return f"{self.claim.text}."
         if self.finding.enough:
@@ -116,12 +116,12 @@ class Judged:
 
 
 def judged(claim: Claim, blocks: Mapping[str, Block], shipped: str) -> Judged:
-    """A claim decided by what is published.
+    """A claim decided from the published blocks.
 
     Args:
         claim: to decide.
-        blocks: all that is published.
-        shipped: the weights of the prior.
+        blocks: all published blocks.
+        shipped: the shipped weights of the prior.
     """
     block = blocks.get(claim.block)
     if block is None or not block.is_measured:
@@ -130,15 +130,15 @@ def judged(claim: Claim, blocks: Mapping[str, Block], shipped: str) -> Judged:
 
 
 def shares(hits: int, n: int, at_least: float, of: str) -> Finding:
-    """A share of runs; few runs can show that it is missed, and not that it is reached.
+    """Finding about a share of runs; few runs can show that it is missed, but not that it is reached.
 
     Args:
-        hits: how many were as wanted.
-        n: how many there were.
-        at_least: share that is asked for.
-        of: what was counted.
+        hits: number of runs as wanted.
+        n: number of runs.
+        at_least: required share.
+        of: counted things, such as "runs".
     """
-    # missed for good, if it would be even had all further ones been right
+    # certainly missed if it would be missed even with all further runs right
     missed = n - hits > (1 - at_least) * max(n, FEW_RUNS)
     return Finding(
         figure=f"{hits} of {n}" + (f", {100 * hits / n:.0f} %" if n else ""),
@@ -150,13 +150,13 @@ def shares(hits: int, n: int, at_least: float, of: str) -> Finding:
 
 
 def paired(values: Sequence[tuple[float, float]], at_least: float, needed: int, of: str = "subjects") -> Finding | None:
-    """The mean of differences in dB, first less second, with the least of them.
+    """Finding about the mean of paired differences in dB, first minus second, with the smallest difference.
 
     Args:
         values: pairs, one for each subject.
-        at_least: what the mean is to reach.
-        needed: how many there must be.
-        of: what was counted.
+        at_least: required mean.
+        needed: least number of pairs.
+        of: counted things, such as "subjects".
     """
     gains = [one - other for one, other in values]
     if not gains:
@@ -171,7 +171,7 @@ def paired(values: Sequence[tuple[float, float]], at_least: float, needed: int, 
 
 
 def value(row: TableRow | None, head: str) -> float | None:
-    """The number in a cell; None without row, column or number."""
+    """The number in a cell; None if row, column or number is missing."""
     return number(row.get(head, "")) if row else None
 
 
@@ -181,5 +181,5 @@ def column(rows: Iterable[TableRow], head: str) -> list[float]:
 
 
 def table_after(block: Block, words: str) -> Table | None:
-    """The first table with these words right above it."""
+    """The first table directly below the given words."""
     return next((table for table in block.tables if words in table.before), None)

@@ -1,4 +1,4 @@
-"""Claims that other pages measure: verdicts, presets, prior and gate, masks, what no slice saw, another program."""
+"""Claims measured on other pages: verdicts, presets, prior, distillation and gate."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from studies.results.findings import FEW, NOTICEABLE_DB, Claim, Finding, column,
 from studies.stress.outcome import FALSE
 
 MEANS = "mean gain over the quicker one"
-"""The last row of the table of presets, where each is compared with the one before it."""
+"""First cell of the last row of the preset table, which compares each preset with the previous one."""
 
 SEEDS = 3
-"""Trainings of a variant that show more than their own chance."""
+"""Least number of trainings of a variant that shows more than chance."""
 
 
 EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject", "stress-drawn-later": "Every subject"}
-"""Title of the table of all runs, by the block of the study."""
+"""Title of the table of all runs, by block."""
 
 AT_ONCE = {
     "stress-sweep": ", one thing wrong at a time on heads that limits were set on",
     "stress-drawn": ", all drawn at once on heads that limits were set on",
     "stress-drawn-later": ", all drawn at once again with one limit raised on two of these",
 }
-"""What claims about a study say of it."""
+"""Words about the study in its claims, by block."""
 
 
 def warned(bad: bool, study: str) -> Claim:
-    """What the verdict says of bad runs, or of good ones.
+    """Claim that the verdict warns about bad runs, or does not warn about good ones.
 
     Args:
-        bad: which.
-        study: its block.
+        bad: True for bad runs, False for good ones.
+        study: block of the study.
     """
 
     def find(block: Block) -> Finding | None:
@@ -58,10 +58,10 @@ def warned(bad: bool, study: str) -> Claim:
 
 
 def false_alarms(study: str) -> Claim:
-    """How many good runs are warned about although nothing is wrong with their stacks.
+    """Claim about the number of good runs with a warning although nothing is wrong with their stacks.
 
     Args:
-        study: its block.
+        study: block of the study.
     """
 
     def find(block: Block) -> Finding | None:
@@ -82,7 +82,7 @@ def false_alarms(study: str) -> Claim:
 
 
 def preset_gain(preset: str, over: str, n_stacks: int) -> Claim:
-    """What a slower preset has over a quicker one.
+    """Claim about the gain of a slower preset over a quicker one.
 
     Args:
         preset: the slower.
@@ -118,11 +118,11 @@ def preset_gain(preset: str, over: str, n_stacks: int) -> Claim:
 
 
 def over_prior(n_stacks: int, at_least: float) -> Claim:
-    """What the volume of `balanced` has over V_prior from one stack or two, on every subject.
+    """Claim about the gain of the `balanced` volume over V_prior from one stack or two, on every subject.
 
     Args:
         n_stacks: of the subjects.
-        at_least: what each of them is to have.
+        at_least: required gain in dB of each subject.
     """
     words = f"{n_stacks} stack{'s' * (n_stacks != 1)}"
 
@@ -147,7 +147,7 @@ def over_prior(n_stacks: int, at_least: float) -> Claim:
 
 
 def preset_limit(preset: str) -> Claim:
-    """Seconds of the whole command and decibels below `accurate`, against their limits in the table."""
+    """Claim that seconds of the whole command and dB below `accurate` stay within their limits in the table."""
 
     def find(block: Block) -> Finding | None:
         table = next((table for table in block.tables if table.rows and "at most" in table.rows[0]), None)
@@ -162,7 +162,7 @@ def preset_limit(preset: str) -> Claim:
         if loss:
             figure += f", {max(loss):.2f} dB of {allowed[0]:g} dB less than `accurate`"
         holds = max(seconds) <= limit and all(one <= most for one, most in zip(loss, allowed, strict=True))
-        # each case has to stay below, so that two can show that it fails and not that it always holds
+        # every case must stay within the limits: a single case can show a failure, but few cannot show success
         return Finding(figure=figure, n=len(rows), of="cases", holds=holds, enough=not holds or len(rows) >= FEW)
 
     return Claim(
@@ -176,13 +176,13 @@ def preset_limit(preset: str) -> Claim:
 
 
 def with_prior(first: str, second: str, n_stacks: int, what: str) -> Claim:
-    """What a row of the ablation of the prior has over another.
+    """Claim about the gain of one row of the prior ablation over another.
 
     Args:
-        first: the row.
-        second: the other.
+        first: the better row.
+        second: the other row.
         n_stacks: of the subjects.
-        what: is claimed to help.
+        what: the part that is claimed to help.
     """
     words = f"{n_stacks} stack{'s' * (n_stacks != 1)}"
 
@@ -205,11 +205,11 @@ def with_prior(first: str, second: str, n_stacks: int, what: str) -> Claim:
 
 
 def over_coarse(words: str, at_least: float) -> Claim:
-    """What V_prior has over V_coarse at true poses.
+    """Claim about the gain of V_prior over V_coarse at true poses.
 
     Args:
-        words: number of stacks as the table writes it.
-        at_least: decibels that were asked for.
+        words: number of stacks as written in the table.
+        at_least: required gain in dB.
     """
 
     def find(block: Block) -> Finding | None:
@@ -230,11 +230,11 @@ def over_coarse(words: str, at_least: float) -> Claim:
 
 
 def gate(head: str, where: str) -> Claim:
-    """What density in F and as a gate brings.
+    """Claim about the gain by density as an input of F and in the gate.
 
     Args:
         head: of the column.
-        where: in words.
+        where: the part of the brain, in words.
     """
 
     def find(block: Block) -> Finding | None:
@@ -259,7 +259,7 @@ def gate(head: str, where: str) -> Claim:
 
 
 def verdicts() -> Iterator[Claim]:
-    """Whether g3r says when a volume may not be used."""
+    """Claims about the verdict on unusable volumes."""
     for study in EVERY:
         yield warned(True, study)
         yield warned(False, study)
@@ -267,7 +267,7 @@ def verdicts() -> Iterator[Claim]:
 
 
 def presets() -> Iterator[Claim]:
-    """Speed against accuracy."""
+    """Claims about speed and accuracy of the presets."""
     yield preset_gain("balanced", "fast", 3)
     yield preset_gain("accurate", "balanced", 3)
     yield preset_gain("accurate", "balanced", 2)
@@ -278,7 +278,7 @@ def presets() -> Iterator[Claim]:
 
 
 def prior() -> Iterator[Claim]:
-    """The prior, its distillation and its gate."""
+    """Claims about the prior, its distillation and its gate."""
     for n in (1, 2, 3):
         yield with_prior("with distillation", "fit without prior", n, "The prior with distillation")
     for n in (1, 2, 3):

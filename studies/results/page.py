@@ -1,4 +1,4 @@
-"""`make results`: docs/results.md, from what studies have published in the other pages; nothing in it is typed.
+"""`make results`: generates docs/results.md from the blocks that studies published in the other pages.
 
 `python -m studies.results.page` is the same command.
 """
@@ -44,7 +44,7 @@ CONCLUSIONS = (
     ("Too few to say, and so far it does not hold", UNSAID, SO_FAR[1]),
     ("Not measured yet", MISSING, ""),
 )
-"""Headings, with the outcome and what it looks like so far."""
+"""Headings, each with an outcome and a preliminary outcome."""
 
 PICTURES = {
     "paper-methods": (("paper-methods.png", "slices of one phantom by every method, with maps of the error"),),
@@ -52,17 +52,17 @@ PICTURES = {
     "paper-variants-atlas": (("paper-stacks-atlas.png", "PSNR of the fit and its parts by number of stacks"),),
     "presets": (("presets.png", "PSNR against CPU seconds, a curve for each subject"),),
 }
-"""By the block that they show."""
+"""Pictures with captions, by the block that they illustrate."""
 
 
 def judgements(blocks: Mapping[str, Block]) -> dict[str, list[Judged]]:
-    """Every claim decided, by topic."""
+    """All decided claims, by topic."""
     shipped = weights(None)
     return {topic: [judged(claim, blocks, shipped) for claim in claims()] for topic, claims in TOPICS.items()}
 
 
 def page(blocks: Mapping[str, Block]) -> str:
-    """What stands between the markers of docs/results.md."""
+    """The text between the markers of docs/results.md."""
     found = judgements(blocks)
     parts = [
         "## In plain words",
@@ -78,7 +78,7 @@ def page(blocks: Mapping[str, Block]) -> str:
 
 
 def conclusions(found: Sequence[Judged]) -> Iterator[str]:
-    """A sentence for each claim, by its outcome."""
+    """A sentence per claim, grouped by outcome."""
     number = {outcome: sum(one.outcome == outcome for one in found) for outcome in (HOLDS, FAILS, UNSAID, MISSING)}
     yield _wrapped(
         f"Of {len(found)} claims {number[HOLDS]} hold, {number[FAILS]} do not hold, {number[UNSAID]} cannot be decided "
@@ -92,7 +92,7 @@ def conclusions(found: Sequence[Judged]) -> Iterator[str]:
 
 
 def claims_tables(found: Mapping[str, Sequence[Judged]], blocks: Mapping[str, Block]) -> Iterator[str]:
-    """Figures, outcomes, and where each was measured."""
+    """Tables of claims with figure, outcome and source."""
     for topic, several in found.items():
         yield f"### {topic}"
         rows = [
@@ -133,7 +133,7 @@ def main_tables(blocks: Mapping[str, Block]) -> Iterator[str]:
 
 
 def sources(blocks: Mapping[str, Block]) -> Iterator[str]:
-    """How old each table is: what it says of its machine, commit and weights."""
+    """Machine, commit and weights that each table states."""
     shipped = weights(None)
     yield _wrapped(
         f"The shipped weights of the prior are {shipped}. *Older weights* marks tables of others. A commit with a + "
@@ -157,7 +157,7 @@ def sources(blocks: Mapping[str, Block]) -> Iterator[str]:
 
 
 def _lead(before: str) -> str:
-    """Text above a table, without the words that fold it away and tables of other places."""
+    """Text above a table, without the markup that collapses it and without other tables."""
     lines = [line for line in before.splitlines() if line.strip() and not line.startswith("</details>")]
     return "\n\n".join(lines)
 
@@ -179,7 +179,7 @@ def _item(text: str) -> str:
 
 
 def _left(text: str) -> str:
-    """Words are read from the left."""
+    """The table with all columns left-aligned."""
     return text.replace("---:", "---")
 
 

@@ -1,4 +1,4 @@
-"""Claims about the paper's protocol: its Table 1, one stack, the parts of the fit, real stacks."""
+"""Claims about the paper's protocol: Table 1, one stack, the parts of the fit, real stacks."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from studies.results.paper_measures import LPIPS, PSNR, SSIM, ahead, gain_said, 
 from studies.tables import stacks
 
 SETS = {"": ("phantoms", 12), "-atlas": ("atlas volumes", 4)}
-"""Of subjects, by the ending of their blocks: what they are, and how many there must be. Of 16 phantoms some may be
-refused; of the four atlas volumes none may be missing."""
+"""Sets of subjects, by the ending of their blocks: name and least number. Some of the 16 phantoms may be refused; none
+of the four atlas volumes may be missing."""
 
 
 def table_1() -> Iterator[Claim]:
-    """Three stacks with moderate motion."""
+    """Claims about three stacks with moderate motion."""
     for ending, (kind, needed) in SETS.items():
         block = f"paper-methods{ending}"
         yield Claim(
@@ -72,7 +72,7 @@ def table_1() -> Iterator[Claim]:
 
 
 def mild_motion() -> Iterator[Claim]:
-    """Three stacks of phantoms with mild motion; atlas volumes were not asked for."""
+    """Claims about three stacks of phantoms with mild motion; atlas volumes are not required."""
     kind, needed = SETS[""]
     for head in (PSNR, SSIM, LPIPS):
         name = head.split(",")[0]
@@ -87,7 +87,7 @@ def mild_motion() -> Iterator[Claim]:
 
 
 def one_stack() -> Iterator[Claim]:
-    """The first stack alone."""
+    """Claims about the first stack alone."""
     for ending, (kind, needed) in SETS.items():
         block = f"paper-methods{ending}"
         yield Claim(
@@ -117,7 +117,7 @@ def one_stack() -> Iterator[Claim]:
 
 
 def parts() -> Iterator[Claim]:
-    """The paper's Fig. 4A."""
+    """Claims about the ablation of the paper's Fig. 4A."""
     for ending, (kind, _) in SETS.items():
         block = f"paper-variants{ending}"
         for n in (1, 2, 3):
@@ -126,7 +126,7 @@ def parts() -> Iterator[Claim]:
                 text=f"Distillation helps, {stacks(n)}, {kind}",
                 asked="1.16 dB or more, as in the paper" if n == 1 else f"{paper:g} dB or more",
                 block=block,
-                # without distillation slices of a single stack stay in place, too
+                # without distillation the slices of a single stack do not move either
                 find=variant(n, HELD_STILL if n == 1 else SHIPPED, NONE, FEW, paper),
                 yes=f"Distillation helps from {stacks(n)} on {kind} ({{figure}}), as the paper says.",
                 no=f"Distillation does not bring from {stacks(n)} on {kind} what the paper says ({{figure}}).",
@@ -151,7 +151,7 @@ def parts() -> Iterator[Claim]:
 
 
 def real() -> Iterator[Claim]:
-    """Stacks of patients, which have no truth."""
+    """Claims about stacks of patients, which have no truth."""
     for than in (PRIOR, SCATTER, SQUARES, VARIATION):
         yield Claim(
             text=f"g3r predicts held-out real stacks better than {than}: PSNR",

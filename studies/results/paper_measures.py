@@ -1,4 +1,4 @@
-"""How claims about the paper's protocol are measured: from the tables of docs/paper.md."""
+"""Measures for the claims about the paper's protocol, from the tables of docs/paper.md."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ PSNR, SSIM, LPIPS = "PSNR, dB", "SSIM", "LPIPS"
 
 
 def of_condition(block: Block, n_stacks: int, place: str = "mask", motion: str = "moderate") -> Table | None:
-    """Table 1.
+    """Table 1 of one condition; None if the block lacks it.
 
     Args:
         block: of all methods.
-        n_stacks: that volumes are made of.
+        n_stacks: number of stacks that the volumes are made from.
         place: "mask" or "grid".
         motion: its level.
     """
@@ -32,14 +32,14 @@ def of_condition(block: Block, n_stacks: int, place: str = "mask", motion: str =
 
 
 def level(n_stacks: int, head: str, at: float, needed: int, *, most: bool = False) -> Find:
-    """A score of g3r itself.
+    """Measure of a score of g3r itself.
 
     Args:
-        n_stacks: that volumes are made of.
+        n_stacks: number of stacks that the volumes are made from.
         head: of the column.
-        at: what is asked for.
-        needed: subjects.
-        most: the score is to be at most that.
+        at: required value.
+        needed: least number of subjects.
+        most: whether the score must be at most `at` instead of at least.
     """
 
     def find(block: Block) -> Finding | None:
@@ -66,13 +66,13 @@ def ahead(
     place: str = "mask",
     motion: str = "moderate",
 ) -> Find:
-    """By how much a method is better than the best of others that were made of as many subjects.
+    """Measure of the lead of a method over the best of the others that have the same number of subjects.
 
     Args:
-        n_stacks: that volumes are made of.
+        n_stacks: number of stacks that the volumes are made from.
         head: of the column; LPIPS is better when lower.
-        needed: subjects.
-        of: the others; all but V_prior when none are named.
+        needed: least number of subjects.
+        of: the others; without any, all methods but V_prior.
         first: the method.
         at_least: what the difference is to reach; with 0 it is to be above, by two units of the third digit.
         place: "mask" or "grid".
@@ -88,7 +88,7 @@ def ahead(
         sign = -1 if head == LPIPS else 1
         names = of or [row["method"] for row in table.rows if row["method"] not in (first, PRIOR)]
         known = {name: other for name in names if (other := value(table.row(name), head)) is not None}
-        # means over other subjects are not compared
+        # means over different numbers of subjects are not compared
         same = [name for name in known if value(table.row(name), "subjects") == n]
         gains = {name: sign * (own - known[name]) for name in same}
         if not gains:
@@ -108,13 +108,13 @@ def ahead(
 
 
 def gain_said(n_stacks: int, over: str, at_least: float, needed: int) -> Find:
-    """By how much g3r is above the best of a kind, as the line above the table says it, from more digits.
+    """Measure of g3r's gain over the best of a kind, from the line above the table, which has more digits.
 
     Args:
-        n_stacks: that volumes are made of.
+        n_stacks: number of stacks that the volumes are made from.
         over: the kind, in the words of the line.
-        at_least: what is asked for.
-        needed: subjects.
+        at_least: required gain.
+        needed: least number of subjects.
     """
 
     def find(block: Block) -> Finding | None:
@@ -135,14 +135,14 @@ def gain_said(n_stacks: int, over: str, at_least: float, needed: int) -> Find:
 
 
 def variant(n_stacks: int, first: str, second: str, needed: int, at_least: float = NOTICEABLE_DB) -> Find:
-    """What a variant of the fit has over another.
+    """Measure of the gain of one variant of the fit over another.
 
     Args:
-        n_stacks: that volumes are made of.
-        first: name of the one.
-        second: name of the other.
-        needed: subjects.
-        at_least: what the difference is to reach.
+        n_stacks: number of stacks that the volumes are made from.
+        first: name of the better variant.
+        second: name of the other variant.
+        needed: least number of subjects.
+        at_least: required difference.
     """
 
     def find(block: Block) -> Finding | None:
@@ -161,10 +161,10 @@ def variant(n_stacks: int, first: str, second: str, needed: int, at_least: float
 
 
 def predicts_better(than: str, head: str) -> Find:
-    """How much better g3r predicts held-out real stacks than another volume.
+    """Measure of how much better g3r predicts held-out real stacks than another volume.
 
     Args:
-        than: the other.
+        than: name of the other volume.
         head: of the column.
     """
 

@@ -1,4 +1,4 @@
-"""Claims about masks, about what no slice saw, and beside another program."""
+"""Claims about masks, about the unseen part of the head, and in comparison with another program."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from studies.results.blocks import Block, TableRow, number
 from studies.results.findings import FEW, Claim, Finding, column, paired, shares, value
 
 MIN_DICE = 0.92
-"""With masks that people drew in real stacks."""
+"""Required Dice coefficient with hand-drawn masks of real stacks."""
 
 
 def counted(
     block: str, pattern: str, at_least: float, text: str, *, of: str, asked: bool = False, reverse: bool = False
 ) -> Claim:
-    """A share that a sentence above a table gives.
+    """Claim about a share that is stated in a sentence above a table.
 
     Args:
         block: with the sentence.
         pattern: with groups `hits` and `n`.
-        at_least: share that is asked for.
+        at_least: required share.
         text: the claim.
-        of: what is counted.
-        asked: somebody asked for that share.
-        reverse: the sentence counts those that are wrong.
+        of: counted things.
+        asked: whether the share was asked for.
+        reverse: whether the sentence counts the wrong ones.
     """
 
     def find(found_in: Block) -> Finding | None:
@@ -47,7 +47,7 @@ def counted(
 
 
 def real_masks() -> Claim:
-    """Overlap with masks that people drew."""
+    """Claim about the overlap with hand-drawn masks."""
 
     def find(block: Block) -> Finding | None:
         rows = block.tables[0].rows
@@ -67,7 +67,7 @@ def real_masks() -> Claim:
 
 
 def volumes_of_real_masks() -> Claim:
-    """What volumes of found and of drawn masks predict."""
+    """Claim about the predictions by volumes from found and from drawn masks."""
 
     def find(block: Block) -> Finding | None:
         rows = block.tables[0].rows
@@ -116,11 +116,11 @@ def cost_of_masks(beside: str) -> Claim:
 
 
 def fill(first: str, second: str, text: str) -> Claim:
-    """What one fill of the unseen part has over another.
+    """Claim about the gain of one fill of the unseen part over another.
 
     Args:
-        first: the one.
-        second: the other.
+        first: name of the better fill.
+        second: name of the other fill.
         text: the claim.
     """
 
@@ -143,7 +143,7 @@ def fill(first: str, second: str, text: str) -> Claim:
 
 
 def noticed() -> Claim:
-    """Subjects with missing slices whose poses are wrong."""
+    """Claim about the warnings for subjects with missing slices and wrong poses."""
 
     def find(block: Block) -> Finding | None:
         found = re.search(r"Median TRE under 1 mm: (\d+) of (\d+); of the others (\d+) without a warning", block.text)
@@ -163,7 +163,7 @@ def noticed() -> Claim:
 
 
 def nesvor() -> Iterator[Claim]:
-    """One case that was run by both."""
+    """Claims about one case that both programs reconstructed."""
 
     def compared(head: str, unit: str, sign: int) -> Claim:
         def find(block: Block) -> Finding | None:
@@ -184,7 +184,7 @@ def nesvor() -> Iterator[Claim]:
 
 
 def masks() -> Iterator[Claim]:
-    """Masks that nobody drew."""
+    """Claims about automatic masks."""
     heads = r"(?P<n>\d+) stacks with a head: found in (?P<hits>\d+)"
     none = r"(?P<n>\d+) stacks without a head: in (?P<hits>\d+) of them one was found"
     yield counted("masks-simulated", heads, 0.95, "A head is found where there is one", of="simulated stacks")
@@ -198,7 +198,7 @@ def masks() -> Iterator[Claim]:
 
 
 def unseen() -> Iterator[Claim]:
-    """Slices that are missing."""
+    """Claims about missing slices."""
     block = "unseen-sweep"
     within, under = (
         "Missing slices: brain volume within 3 % of the truth",

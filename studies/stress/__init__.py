@@ -1,1 +1,1 @@
-"""Studies of what goes wrong in practice, for docs/stress.md."""
+"""Studies of faults that occur in practice: docs/stress.md."""

@@ -1,4 +1,4 @@
-"""What is done to simulated stacks that simulation itself does not: wrong headers, wrong masks, wrong stacks."""
+"""Faults added to simulated stacks after the simulation: wrong headers, wrong masks, wrong stacks."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Damage:
     """A change of a subject's stacks.
 
     Attributes:
-        apply: to its stacks; gets those of another subject and a generator, too.
-        last_without_truth: whether the last stack has no true place any more.
+        apply: function of the subject's stacks, the stacks of another subject, and a random generator.
+        last_without_truth: whether the last stack has no true poses any more.
     """
 
     apply: Callable[[Stacks, Stacks, np.random.Generator], Stacks]
@@ -29,19 +29,19 @@ class Damage:
 
 
 def first_stacks(n: int) -> Damage:
-    """Only the first `n` stacks."""
+    """Keep only the first `n` stacks."""
     return Damage(lambda stacks, other, rng: stacks[:n])
 
 
 def stated_thickness(factor: float) -> Damage:
-    """A thickness that is wrong by a factor, in all stacks."""
+    """State a thickness that is wrong by a factor, in all stacks."""
     return Damage(
         lambda stacks, other, rng: tuple(replace(one, thickness_mm=factor * one.thickness_mm) for one in stacks)
     )
 
 
 def masks_grown(pixels: int) -> Damage:
-    """Masks dilated by some pixels in the plane; eroded where the number is negative."""
+    """Dilate masks in plane by a number of pixels; a negative number erodes them."""
     change = binary_dilation if pixels > 0 else binary_erosion
 
     def grown(stack: Stack) -> Stack:
@@ -51,7 +51,7 @@ def masks_grown(pixels: int) -> Damage:
 
 
 def slices_lost(share: float) -> Damage:
-    """Slices without a mask, here and there in all stacks."""
+    """Remove the masks of random slices in all stacks."""
 
     def lost(stack: Stack, rng: np.random.Generator) -> Stack:
         return replace(stack, mask=stack.mask & (rng.random(stack.mask.shape[2]) >= share))
@@ -60,7 +60,7 @@ def slices_lost(share: float) -> Damage:
 
 
 def span_lost(share: float) -> Damage:
-    """The middle of every stack's slices without a mask."""
+    """Remove the masks of the middle slices of every stack."""
 
     def lost(stack: Stack) -> Stack:
         rows = np.flatnonzero(stack.mask.any((0, 1)))
@@ -72,7 +72,7 @@ def span_lost(share: float) -> Damage:
 
 
 def other_contrast() -> Damage:
-    """The last stack with dark fluid and bright tissue."""
+    """Invert the contrast of the last stack: dark fluid and bright tissue."""
 
     def inverted(stack: Stack) -> Stack:
         bright = float(np.percentile(stack.image[stack.mask], 99))
@@ -82,7 +82,7 @@ def other_contrast() -> Damage:
 
 
 def slices_reversed() -> Damage:
-    """The last stack with its slices in reverse order: a mirrored head, which no rigid motion makes right."""
+    """Reverse the slices of the last stack, which mirrors the head; no rigid motion can correct this."""
 
     def reversed_(stack: Stack) -> Stack:
         return replace(stack, image=stack.image[:, :, ::-1], mask=stack.mask[:, :, ::-1])
@@ -91,7 +91,7 @@ def slices_reversed() -> Damage:
 
 
 def halves_swapped() -> Damage:
-    """The last stack with even slices first, then odd ones: files sorted by time in place of position."""
+    """Put the even slices of the last stack before the odd ones, like files sorted by time instead of position."""
 
     def swapped(stack: Stack) -> Stack:
         order = [*range(0, stack.image.shape[2], 2), *range(1, stack.image.shape[2], 2)]
@@ -101,12 +101,12 @@ def halves_swapped() -> Damage:
 
 
 def stack_of_another() -> Damage:
-    """The last stack is one of another head."""
+    """Replace the last stack by a stack of another head."""
     return Damage(lambda stacks, other, rng: (*stacks[:-1], other[len(stacks) - 1]), last_without_truth=True)
 
 
 def nothing() -> Damage:
-    """None."""
+    """No damage."""
     return Damage(lambda stacks, other, rng: stacks)
 
 
@@ -116,7 +116,7 @@ def applied(damage: Damage, stacks: Sequence[Stack], other: Sequence[Stack], rng
     Args:
         damage: to apply.
         stacks: of a subject.
-        other: of another one.
-        rng: draws what is drawn.
+        other: stacks of another subject.
+        rng: source of randomness.
     """
     return damage.apply(tuple(stacks), tuple(other), rng)

@@ -1,7 +1,7 @@
-"""`python -m studies.stress.drawn`: everything drawn at once, as no list of conditions has it, and who notices.
+"""`python -m studies.stress.drawn`: subjects with random combinations of faults, and whether the verdict notices.
 
-`studies.stress.sweep` makes one thing wrong at a time. Hospitals do not: head, motion, number and size of slices,
-noise, masks, headers and stacks that do not belong are drawn here for each subject by itself.
+`studies.stress.sweep` has one fault at a time. In hospitals faults are combined, so this study draws head, motion,
+number and size of slices, noise, masks, headers and stacks that do not belong independently for each subject.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ VOLUMES = (
     "spina-bifida/sb33-operated",
     "spina-bifida/sb34-operated",
 )
-"""That no training has seen."""
+"""Volumes that were not used for training."""
 
 FIRST_SEED = 95_000
-"""Seeds from here on belong to this study; those of heads that spoil another subject begin `OTHERS` later. Rules were
-changed on the first 42 subjects; those from 100 to 141 were measured first, and one limit was changed on two of them
-afterwards (`STANDS_APART`)."""
+"""First seed of this study; seeds of the heads whose stacks spoil another subject begin at FIRST_SEED + OTHERS. Rules
+were changed after looking at the first 42 subjects. Subjects 100 to 141 were measured before any change on them; one
+limit was changed afterwards because of two of them (`STANDS_APART`)."""
 
 OTHERS = 500
 
 MOTION_SHARES = {"none": 0.1, "mild": 0.3, "moderate": 0.4, "severe": 0.2}
 
 TWO_STACKS_SHARE = 0.3
-"""The others have three; a single stack is never more than *check*."""
+"""Share of subjects with two stacks; the others have three. A single stack never gets a better verdict than *check*."""
 
 SPOILT_SHARE, LOST_SHARE, STATED_SHARE, GAP_SHARE = 0.25, 0.25, 0.2, 0.3
-"""How many subjects have a stack that does not belong, slices without a mask, a wrong thickness, and gaps."""
+"""Shares of subjects with a stack that does not belong, slices without a mask, a wrong thickness, and gaps."""
 
 SPOILT: dict[str, Callable[[], Damage]] = {
     "another contrast": damage.other_contrast,
@@ -53,7 +53,7 @@ SPOILT: dict[str, Callable[[], Damage]] = {
     "sorted by time": damage.halves_swapped,
     "another head": damage.stack_of_another,
 }
-"""What the last stack may be."""
+"""Faults of a last stack that does not belong to the others."""
 
 MASK_PIXELS = (-2, -1, 0, 0, 0, 1, 2, 4)
 
@@ -62,12 +62,12 @@ PROFILES: tuple[Profile, ...] = ("box", "gaussian", "sinc")
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSubject(SubjectSpec):
-    """A head and how it is scanned.
+    """A head and its acquisition settings.
 
     Args:
         pixel_mm: in-plane spacing.
         thickness_mm: of a slice.
-        gap_mm: between slices.
+        gap_mm: between the facing edges of neighbouring slices.
         snr: see `StackSettings`.
         interleave: see `StackSettings`.
         oblique_deg: see `StackSettings`.
@@ -84,7 +84,7 @@ class DrawnSubject(SubjectSpec):
     turned: bool = True
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """How its stacks are taken."""
+        """Acquisition settings of its stacks."""
         return [
             replace(
                 one,
@@ -102,14 +102,14 @@ class DrawnSubject(SubjectSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class Draw:
-    """One subject and all that is wrong with its stacks.
+    """One subject and all faults of its stacks.
 
     Attributes:
         subject: the head.
-        n_stacks: that are given.
+        n_stacks: number of stacks.
         spoilt: a key of `SPOILT`, or empty.
-        mask_pixels: that masks are dilated by.
-        stated: the stated thickness over the true one.
+        mask_pixels: pixels by which masks are dilated.
+        stated: ratio of the stated thickness to the true one.
         lost: share of slices without a mask.
     """
 
@@ -128,7 +128,7 @@ class Draw:
         return replace(self.subject, name=f"drawn-{seed}", volume=volume, seed=seed)
 
     def damages(self) -> Iterator[Damage]:
-        """In the order in which they are done."""
+        """The damages in their order."""
         yield damage.first_stacks(self.n_stacks)
         if self.spoilt:
             yield SPOILT[self.spoilt]()
@@ -140,7 +140,7 @@ class Draw:
             yield damage.stated_thickness(self.stated)
 
     def text(self) -> str:
-        """What is special, for tables."""
+        """The deviations from a usual subject in words, for tables."""
         one = self.subject
         found = [
             one.volume.rsplit("/", 1)[-1],
@@ -185,13 +185,13 @@ def drawn(n: int) -> Draw:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """One for each subject."""
+    """One task per subject."""
     for n in range(options.first, options.first + options.subjects):
         yield Task(str(n), measure, (n, options))
 
 
 def measure(n: int, options: argparse.Namespace) -> Row:
-    """One subject.
+    """Reconstruct one subject and compare its verdict with the truth.
 
     Args:
         n: its number.
@@ -213,13 +213,13 @@ def measure(n: int, options: argparse.Namespace) -> Row:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished subject."""
+    """Progress line of a finished subject."""
     figures = f"{row['psnr_db']:.2f} dB, {row['off_share']:.0%} off, " if "psnr_db" in row else ""
     return f"{key}: {row['drawn']}: {figures}{'bad' if row['bad'] else 'good'}, {row['reason']}"
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Two sentences on all; every subject below."""
+    """Summary sentences about all subjects, then a table of every subject."""
     rows = list(record["rows"].values())
     kept = [row for row in rows if row["spoilt"] and row["spoilt"] not in row.get("left_out", [])]
     psnr_db = [row["psnr_db"] for row in rows if "psnr_db" in row]
@@ -239,7 +239,7 @@ def _lacks_the_spoilt(row: Row) -> bool:
 
 
 def _warning(row: Row) -> str:
-    """Whether a warning is about a bad result or names what is wrong here; empty where there is none."""
+    """`TRUE` for a warning about a bad result or an existing fault, else `FALSE`; empty without a warning."""
     if is_use(row):
         return ""
     masks = "the mask of" in row["reason"] and row.get("mask_pixels", 0) < 0

@@ -1,4 +1,4 @@
-"""What came of a run on stacks in which something is wrong, and how often its verdict was right."""
+"""Outcome of a run on stacks with faults, and how often its verdict was right."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from studies.harness import Row
 from studies.runs import BAD_OFF_SHARE, aligned, off_share
 
 BAD_PSNR_DB = 20.0
-"""A result is bad if its volume is worse, or if more than `BAD_OFF_SHARE` of the brain in its slices is off."""
+"""A result is bad if its PSNR is lower than this, or if more than `BAD_OFF_SHARE` of the brain in its slices is
+misplaced."""
 
 TRUE, FALSE = "true", "false alarm"
-"""What a warning is: it names a fault of the stacks, or nothing that is wrong with them."""
+"""Kinds of a warning: TRUE for one about a bad or incomplete result or an existing fault, FALSE for any other."""
 
 
 def outcome(case: SimulatedCase, options: argparse.Namespace) -> Row:
-    """A subject reconstructed: errors, the verdict, and whether it is bad; a refusal is bad, with its reason alone.
+    """Reconstruct a subject: errors, verdict, and whether the result is bad. A refusal is bad and has only its reason.
 
     Args:
-        case: the subject, with the places of those slices that have a true one.
-        options: of the command; its preset and prior count.
+        case: the subject, with the true poses of the slices that have one.
+        options: of the command; preset and prior are used.
     """
     try:
         result = GaussianReconstructor(options.ckpt, PRESETS[options.preset]).reconstruct(case.stacks)
@@ -47,11 +48,11 @@ def outcome(case: SimulatedCase, options: argparse.Namespace) -> Row:
 
 
 def verdicts(rows: Sequence[Row], warning: Callable[[Row], str]) -> str:
-    """How often each verdict was said of bad and of good results.
+    """Number of each verdict for bad and for good results, in words.
 
     Args:
         rows: of `outcome`.
-        warning: `TRUE` or `FALSE` for the warning of a row, empty where there is none.
+        warning: `TRUE` or `FALSE` for the warning of a row, empty without a warning.
     """
     bad, good = [row for row in rows if row["bad"]], [row for row in rows if not row["bad"]]
     return (
@@ -80,15 +81,15 @@ def is_check(row: Row) -> bool:
 
 
 def lacks_a_stack(row: Row) -> bool:
-    """Whether the volume was made without a stack that was given."""
+    """Whether a given stack was left out of the volume."""
     return bool(row.get("left_out"))
 
 
 def says_unseen(row: Row) -> bool:
-    """Whether the verdict says that the volume is incomplete, which pose errors and PSNR do not count as bad."""
+    """Whether the verdict says that the volume is incomplete, which neither pose errors nor PSNR show."""
     return not is_use(row) and "not seen by any slice" in row["reason"]
 
 
 def count(rows: Sequence[Row], holds: Callable[[Row], bool]) -> int:
-    """How many rows hold it."""
+    """Number of rows for which `holds` is true."""
     return sum(map(holds, rows))

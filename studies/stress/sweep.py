@@ -1,4 +1,4 @@
-"""`python -m studies.stress.sweep`: one thing wrong at a time, and whether the verdict says so when it matters."""
+"""`python -m studies.stress.sweep`: one fault at a time, and whether the verdict warns about it when it matters."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import Cell, details, table
 
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
-"""Weeks that no training has seen."""
+"""Weeks that were not used for training."""
 
 FIRST_SEED = 91_000
-"""Seeds from here on belong to this study."""
+"""First seed of this study."""
 
 ONE_STACK = "one stack"
-"""What is wrong where the others are as they should be."""
+"""Name of the faults that concern one stack only."""
 
 LAST = "stack-2.nii.gz"
-"""The stack that is spoilt where one is."""
+"""Name of the stack with the fault if it concerns one stack only."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """One thing that differs from three clean stacks with moderate motion.
+    """One deviation from three clean stacks with moderate motion.
 
     Attributes:
-        what: differs.
-        level: of it.
+        what: name of the deviation.
+        level: its level.
         motion: of the head.
         taken: settings of the stacks (`StackSettings`) that differ.
-        damage: to the stacks afterwards.
-        fault: words of a verdict that names what is wrong here, right also where the volume is good.
+        damage: to the stacks after the simulation.
+        fault: words of a verdict that names this fault; such a warning is right even if the volume is good.
     """
 
     what: str
@@ -65,7 +65,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """Of its rows."""
+        """Name of its rows."""
         return f"{self.what}: {self.level}"
 
 
@@ -105,7 +105,7 @@ CONDITIONS = tuple(_conditions())
 
 @dataclass(frozen=True, kw_only=True)
 class StressedSubject(SubjectSpec):
-    """A subject whose stacks are taken otherwise.
+    """A subject with different acquisition settings.
 
     Args:
         taken: see `Condition`.
@@ -114,12 +114,12 @@ class StressedSubject(SubjectSpec):
     taken: Mapping[str, Any]
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """How its stacks are taken."""
+        """Acquisition settings of its stacks."""
         return [replace(one, **self.taken) for one in super().acquisition(n_stacks)]
 
 
 def subject_of(condition: Condition, n: int) -> StressedSubject:
-    """Subject `n`; its head and the seed of its motion are the same under all conditions."""
+    """Subject `n`, with the same head and motion seed under all conditions."""
     seed, volume = FIRST_SEED + n, VOLUMES[n % len(VOLUMES)]
     taken = "-".join(f"{key}{value:g}" for key, value in condition.taken.items())
     name = f"stress-{seed}-{condition.motion}{'-' * bool(taken)}{taken}"
@@ -127,14 +127,17 @@ def subject_of(condition: Condition, n: int) -> StressedSubject:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every condition of the first subject, then of the next: what an interrupted study holds is comparable."""
+    """Tasks for every condition of the first subject, then of the next.
+
+    The conditions of an interrupted study then have the same subjects.
+    """
     for n in range(options.subjects):
         for condition in CONDITIONS:
             yield Task(f"{condition.name} {n}", measure, (condition.name, n, options))
 
 
 def measure(name: str, n: int, options: argparse.Namespace) -> Row:
-    """One subject under one condition.
+    """Reconstruct one subject under one condition.
 
     Args:
         name: of the condition.
@@ -153,13 +156,13 @@ def measure(name: str, n: int, options: argparse.Namespace) -> Row:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished run."""
+    """Progress line of a finished run."""
     figures = f"{row['psnr_db']:.2f} dB, TRE {row['median_mm']:.2f} mm, " if "psnr_db" in row else ""
     return f"{key}: {figures}{'bad' if row['bad'] else 'good'}, {row['reason']}"
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A sentence on all runs and a row for each condition; every run below."""
+    """Summary of all runs and a row for each condition, then a table of every run."""
     rows = [{"name": name, **row} for name, row in record["rows"].items()]
     groups = [[row for row in rows if f"{row['what']}: {row['level']}" == one.name] for one in CONDITIONS]
     summary = [{"what": group[0]["what"], "level": group[0]["level"], "of": group} for group in groups if group]
@@ -172,12 +175,12 @@ def tables(record: Record) -> dict[str, str]:
 
 
 def _lacks_the_wrong_one(row: Row) -> bool:
-    """Whether the one stack that was spoilt was left out, and no other."""
+    """Whether the stack with the fault was left out, and no other."""
     return row["what"] == ONE_STACK and row.get("left_out") == [LAST]
 
 
 def _warning(row: Row) -> str:
-    """Whether a warning is about a bad result or names a fault that the stacks have; empty where there is none."""
+    """`TRUE` for a warning about a bad result or an existing fault, else `FALSE`; empty without a warning."""
     if is_use(row):
         return ""
     if row["bad"]:

@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.convergence`: how many steps a fit needs to within 0.1 dB of where it ends."""
+"""`python -m studies.tradeoff.convergence`: number of steps that a fit needs to come within 0.1 dB of its end."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from studies.subjects import chosen_folders, read_case
 from studies.tables import table
 
 STEPS = (10, 20, 40, 80, 160, 320)
-"""Each is a fit of its own, so that its step sizes fall to their end."""
+"""Numbers of steps. Each is a separate fit, so that its step sizes decay completely."""
 
 NEAR_DB = 0.1
 
 _GAUSSIANS_ALONE = {"held_out": None, "prior_weight": 0.0, "voxel_correction": None}
-"""What comes after the fit makes good on voxels what too few steps have left, and takes no steps."""
+"""Settings without the corrections after the fit, which take no steps and would repair on voxels a fit with too few."""
 
 _NO_AMPLITUDES = {"prior_stage.amplitude_iterations": 0, "slice_stage.amplitude_iterations": 0}
 _UNFITTED = {"use_prior": False, "prior_stage.n_steps": 0}
@@ -35,7 +35,7 @@ WAYS: dict[str, Mapping[str, Any]] = {
     "amplitudes by least squares first": _UNFITTED,
     "started at the prior (as shipped)": {},
 }
-"""Changes of the settings, one more thing at a time; the first is what a fit without any of them is."""
+"""Changes of the settings. From one entry to the next the fit gains one part; the first has none of them."""
 
 
 def steps_to_near(steps: Sequence[int], psnr_db: Sequence[float], goal_db: float) -> float | None:
@@ -44,10 +44,10 @@ def steps_to_near(steps: Sequence[int], psnr_db: Sequence[float], goal_db: float
     Args:
         steps: ascending.
         psnr_db: at each.
-        goal_db: to come near to.
+        goal_db: goal of the curve.
 
     Returns:
-        None where it never does.
+        Number of steps, or None if the curve never comes that close.
     """
     target = goal_db - NEAR_DB
     for n in range(len(steps)):
@@ -60,7 +60,7 @@ def steps_to_near(steps: Sequence[int], psnr_db: Sequence[float], goal_db: float
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every number of steps of every way, case by case."""
+    """One task per number of steps and way, case by case."""
     for folder in chosen_folders(options.folders):
         for way in WAYS:
             for n_steps in STEPS:
@@ -68,7 +68,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, way: str, n_steps: int, options: argparse.Namespace) -> Row:
-    """Measure one fit; all fits of a case share its registration.
+    """Measure one fit; all fits of a case use the same registration.
 
     Args:
         folder: of the case.
@@ -93,7 +93,7 @@ def measure(folder: Path, way: str, n_steps: int, options: argparse.Namespace) -
 
 
 def tables(record: Record) -> dict[str, str]:
-    """For each case and way: dB by steps, and steps and CPU seconds to within 0.1 dB of the best of all."""
+    """Table by case and way: dB by steps, and steps and CPU seconds to within 0.1 dB of the best of all."""
     entries = list(record["rows"].values())
     best = {case: max(e["psnr_db"] for e in entries if e["case"] == case) for case in {e["case"] for e in entries}}
     rows = []

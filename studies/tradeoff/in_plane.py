@@ -1,7 +1,8 @@
-"""`python -m studies.tradeoff.in_plane`: how wide slices are taken to be in plane, and what real stacks say of it.
+"""`python -m studies.tradeoff.in_plane`: choice of the in-plane width of the PSF, on cases and on real stacks.
 
-Slices with one blur in plane cannot tell it: a sharper volume seen through more of it gives the same pixels. So cases
-with a known truth are scored, and real stacks are predicted with every blur, the best of which belongs to each volume.
+The slices alone do not determine their in-plane blur: a sharper volume with more blur gives the same pixels. Cases with
+a known truth are therefore scored, and real stacks are predicted with several blurs, of which the best counts for each
+volume.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from studies.subjects import case_folders, read_case
 from studies.tables import Cell, table
 
 WIDTHS = (1.0, 0.85, 0.75, 0.65, 0.55)
-"""In plane, over the nominal one; a box as wide as its pixel has the variance of 0.57."""
+"""In-plane widths relative to the nominal width; 0.57 has the variance of a box of one pixel."""
 
 JUDGED = (0.3, 0.6, 0.8, 1.0)
 """Widths with which a held-out stack is simulated from a finished volume."""
 
 ERODED_PIXELS = 4
-"""At the rim of the mask, where stacks of different masks differ anyway."""
+"""Width of the rim of the mask that is left out, because masks of different stacks differ there anyway."""
 
 
 def _key(width: float) -> str:
-    """Name of a width in a row; a number alone would be a position in a format."""
+    """Name of a width in a row; a format would read a plain number as a position."""
     return f"width {width:g}"
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case; then each real stack predicted from the others."""
+    """One task per case, then one per real stack that is predicted from the others."""
     for folder in case_folders(options.cases):
         yield Task(folder.name, measure, (folder, options))
     for name, pairs, left_out in real_stacks_left_out():
@@ -49,7 +50,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def real_stacks_left_out() -> Iterator[tuple[str, list[tuple[Path, Path]], int]]:
-    """For each real stack a name, the stacks of its head with their masks, and its number among them."""
+    """Name of each real stack, files of the stacks of its head with their masks, and its number among them."""
     pairs = stacks_with_masks()
     for pair in pairs:
         of_head = [one for one in pairs if one[0].parent == pair[0].parent]
@@ -57,7 +58,7 @@ def real_stacks_left_out() -> Iterator[tuple[str, list[tuple[Path, Path]], int]]
 
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
-    """One case with every width, on one registration.
+    """Measure one case with every width, on one registration.
 
     Args:
         folder: of the case.
@@ -74,7 +75,7 @@ def measure(folder: Path, options: argparse.Namespace) -> Row:
 
 
 def predict(pairs: list[tuple[Path, Path]], left_out: int, options: argparse.Namespace) -> Row:
-    """How well volumes of every width predict a stack that they were not made from.
+    """Prediction of a held-out stack by volumes of every width.
 
     Args:
         pairs: stacks of one head and their masks.
@@ -93,7 +94,7 @@ def predict(pairs: list[tuple[Path, Path]], left_out: int, options: argparse.Nam
 
 
 def predictions(result: ReconstructionResult, held_out: Stack) -> dict[str, float]:
-    """PSNR of a stack as a volume predicts it, by the width in plane with which it is simulated.
+    """PSNR of the prediction of a stack, by the in-plane width with which the prediction is simulated.
 
     Args:
         result: with the volume.
@@ -108,7 +109,7 @@ def predictions(result: ReconstructionResult, held_out: Stack) -> dict[str, floa
 
 
 def best_prediction(result: ReconstructionResult, held_out: Stack) -> float:
-    """The highest of these.
+    """The highest PSNR of `predictions`.
 
     Args:
         result: with the volume.
@@ -118,13 +119,13 @@ def best_prediction(result: ReconstructionResult, held_out: Stack) -> float:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case or stack."""
+    """Progress line of a finished case or stack."""
     found = row.get("psnr_db") or {width: max(of.values()) for width, of in row["predicted_db"].items()}
     return f"{key}: " + ", ".join(f"{width}: {psnr:.2f}" for width, psnr in found.items())
 
 
 def tables(record: Record) -> dict[str, str]:
-    """PSNR by the width of the fit; for real stacks by the width with which they are simulated, too."""
+    """Tables of PSNR by the width of the fit, and for real stacks also by the width of the prediction."""
     rows = record["rows"].items()
     of_width: dict[str, Cell] = {f"{width:g}": f"{{psnr_db[{_key(width)}]:.2f}}" for width in WIDTHS}
     cases = table(({"case": key, **row} for key, row in rows if "psnr_db" in row), {"case": "{case}", **of_width})

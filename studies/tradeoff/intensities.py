@@ -1,7 +1,7 @@
-"""`python -m studies.tradeoff.intensities`: gains and fields of slices against the truth, and what they are worth.
+"""`python -m studies.tradeoff.intensities`: errors of gains and bias fields of slices, and their effect on the volume.
 
-What all slices have in common their errors do not show. It shades the volume, with the common bias field (N4) and
-without.
+Errors that all slices have in common do not show in the errors of single slices. They shade the volume, which is
+measured with and without correction of the common bias field (N4).
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from studies.tables import Cell, table
 CASES = ("sta24-severe", "sb28-mild-gap", "sb32-moderate", "sta30-moderate", "sta30-none", "sta34-single")
 
 DEEP_MM = 4.0
-"""Depth in the brain from which pixels count: nearer to its edge the slices' own profile decides."""
+"""Least depth in the brain of pixels that count; nearer to the edge, the slice profile dominates their intensity."""
 
 MIN_PIXELS = 30
-"""Of a slice, for an error of its own."""
+"""Least number of pixels of a slice for which an error is computed."""
 
 SURPRISE = 0.3
-"""Log-intensity from which pixels count less: noise, and edges that are not where they were expected."""
+"""Deviation of log-intensity from which pixels are down-weighted: noise, and edges in unexpected places."""
 
 LENGTH_MM = 40.0
-"""Unit of place in the fit of a line to a slice."""
+"""Unit of length in the linear fit to a slice."""
 
 SHADING_MM = 10.0
-"""Standard deviation of the Gaussian over which a volume and the truth are compared for shading."""
+"""Standard deviation of the Gaussian filter with which shading is measured."""
 
 MASKS = ("as simulated", "in surroundings", "with a rim")
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Each case with each kind of masks."""
+    """One task per case and kind of masks."""
     folders = sorted(path for path in data_folder("cases").iterdir() if path.is_dir())
     for number, folder in enumerate(folders):
         for masks in MASKS if folder.name in CASES else ():
@@ -63,7 +63,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, seed: int, masks: str, options: argparse.Namespace) -> Row:
-    """Errors of gains as registration found them and as they are matched, and of the least-squares volumes of both.
+    """Errors of gains from registration and after matching, and of the least-squares volumes with both.
 
     Args:
         folder: of the case.
@@ -100,7 +100,7 @@ def measure(folder: Path, seed: int, masks: str, options: argparse.Namespace) ->
 
 
 def shading(volume: NDArray[np.floating], truth: Volume, inside: NDArray[np.bool_]) -> float:
-    """Deviation of the log of the smooth factor between a volume and the truth, over voxels deep in the brain.
+    """Standard deviation of the log of the smooth ratio of a volume to the truth, over voxels deep in the brain.
 
     Args:
         volume: [I, J, K] on the grid of the truth.
@@ -119,7 +119,7 @@ def stacks_with(case: SimulatedCase, seed: int, masks: str) -> Sequence[Stack]:
     Args:
         case: black outside its masks.
         seed: of its surroundings.
-        masks: which.
+        masks: one of `MASKS`.
     """
     if masks == MASKS[0]:
         return case.stacks
@@ -131,13 +131,13 @@ def stacks_with(case: SimulatedCase, seed: int, masks: str) -> Sequence[Stack]:
 
 @dataclass(frozen=True, kw_only=True)
 class ExpectedPixels:
-    """What pixels deep in the brain would show at a gain of 1, by the truth.
+    """Expected intensities of pixels deep in the brain, by the truth and with a gain of 1.
 
     Attributes:
         index: [P] numbers of the pixels.
         plane: [P] their slices.
-        value: [P] by the truth.
-        uv: [P, 2] places in the plane, in units of `LENGTH_MM`.
+        value: [P] expected intensities.
+        uv: [P, 2] positions in the plane, in units of `LENGTH_MM`.
     """
 
     index: NDArray[np.int64]
@@ -152,7 +152,7 @@ class ExpectedPixels:
         Args:
             case: with the truth.
             slices: of its stacks.
-            beyond: slices that each stack has before the first of the case.
+            beyond: number of slices that were added before the first slice of the case in each stack.
         """
         row_of: dict[SliceKey, int] = {key: row for row, key in enumerate(case.true.keys)}
         keys = zip(slices.stack_id.tolist(), (slices.slice_index - beyond).tolist(), strict=True)
@@ -169,7 +169,7 @@ class ExpectedPixels:
         return cls(index=index[deep], plane=operator.plane[deep], value=value[deep], uv=uv)
 
     def error(self, poses: Registration) -> float:
-        """Root mean square, over these pixels, of what is smooth in a slice of log(measured / gain / expected)."""
+        """Root mean square, over these pixels, of the smooth part in each slice of log(measured / gain / expected)."""
         measured = poses.slices.value[self.index].astype(np.float64)
         off = np.log(np.maximum(measured, 1e-3 * measured.mean())) - np.log(poses.gain)[self.plane] - np.log(self.value)
         off = np.clip(off - np.median(off), -1, 1)
@@ -188,7 +188,7 @@ class ExpectedPixels:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case."""
+    """Progress line of a finished case."""
     before, after = row["registered"], row["matched"]
     return (
         f"{key}: error {before['error']:.3f} to {after['error']:.3f}, "

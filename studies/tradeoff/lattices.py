@@ -1,6 +1,6 @@
-"""`python -m studies.tradeoff.lattices`: what the mean of fits on shifted lattices brings, and what it takes.
+"""`python -m studies.tradeoff.lattices`: gain and cost of the mean of fits on shifted lattices.
 
-Cases with a known truth are scored; real stacks are predicted from the others, with the best of several blurs.
+Cases with a known truth are scored. Real stacks are predicted from the others, with the best of several blurs.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ NUMBERS = (1, 3, 6)
 
 
 def _key(number: int) -> str:
-    """Name of a number of lattices in a row; a number alone would be a position in a format."""
+    """Name of a number of lattices in a row; a format would read a plain number as a position."""
     return f"lattices {number}"
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case; then each real stack predicted from the others."""
+    """One task per case, then one per real stack that is predicted from the others."""
     for folder in case_folders(options.cases):
         yield Task(folder.name, measure, (folder, options))
     for name, pairs, left_out in real_stacks_left_out():
@@ -37,7 +37,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
-    """One case with every number of lattices, on one registration.
+    """Measure one case with every number of lattices, on one registration.
 
     Args:
         folder: of the case.
@@ -55,7 +55,7 @@ def measure(folder: Path, options: argparse.Namespace) -> Row:
 
 
 def predict(pairs: list[tuple[Path, Path]], left_out: int, options: argparse.Namespace) -> Row:
-    """How well the volumes predict a stack that they were not made from.
+    """Prediction of a held-out stack by the volumes.
 
     Args:
         pairs: stacks of one head and their masks.
@@ -75,12 +75,12 @@ def predict(pairs: list[tuple[Path, Path]], left_out: int, options: argparse.Nam
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case or stack."""
+    """Progress line of a finished case or stack."""
     return f"{key}: " + ", ".join(f"{name}: {psnr:.2f}" for name, psnr in row["psnr_db"].items())
 
 
 def tables(record: Record) -> dict[str, str]:
-    """PSNR and seconds of the fit by the number of lattices."""
+    """Tables of PSNR and seconds of the fit by the number of lattices."""
     columns: dict[str, Cell] = {"case": "{case}"}
     for number in NUMBERS:
         columns[f"{number}, dB"] = f"{{psnr_db[{_key(number)}]:.2f}}"

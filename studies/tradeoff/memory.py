@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.memory`: memory as g3r-infer states it against what its process held, on phantoms."""
+"""`python -m studies.tradeoff.memory`: memory stated by g3r-infer against the memory of its process, on phantoms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIRST_SEED = 61200
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration:
-    """A phantom, how it is scanned, and what is asked for; positional, as the rows of the table."""
+    """A phantom, its stacks, and the options of the run; a row of the table."""
 
     weeks: int
     n_stacks: int
@@ -33,7 +33,7 @@ class Configuration:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """The configuration in words."""
         words = f"{self.weeks} weeks, {self.n_stacks} stacks, {self.preset}, {self.voxel_mm:g} mm"
         return f"{words}, {self.threads} threads {' '.join(self.more)}".strip()
 
@@ -52,24 +52,25 @@ CONFIGURATIONS = (
     Configuration(weeks=37, n_stacks=3, preset="fast", voxel_mm=1.2, more=("--no-prior",)),
     Configuration(weeks=37, n_stacks=3, preset="fast", voxel_mm=0.5, threads=2),
 )
-"""Small and large heads, few and many stacks, coarse and fine voxels; `fast` where nothing else is asked, since it has
-all that needs memory."""
+"""Small and large heads, few and many stacks, coarse and fine voxels; mostly with `fast`, which has all parts that need
+memory."""
 
 LIMITED = (
     Configuration(weeks=30, n_stacks=3, preset="fast", voxel_mm=0.8),
     Configuration(weeks=30, n_stacks=1, preset="fast", voxel_mm=0.5),
 )
-"""Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
+"""Configurations that are run with memory limits: the usual case, where the prior network needs most memory, and a case
+with many voxels."""
 
 
 SHARES = (1.0, 0.9, 0.8, 0.7)
-"""Limits, as shares of what is stated without one."""
+"""Memory limits, as shares of the memory stated without a limit."""
 
 GB = 1e9
 
 
 def _phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
-    """A simulated subject, made if it is not there."""
+    """A simulated subject, made if it does not exist."""
     from data_synth import cli as simulate
 
     where = folder / f"phantom-{weeks}-{n_stacks}"
@@ -111,7 +112,7 @@ def stated(one: Configuration, folder: Path) -> Row:
 
 
 def limited(one: Configuration, folder: Path) -> Row:
-    """The command without a limit and below several."""
+    """Runs of the command without a limit and with several limits."""
     case, output = _phantom(one.weeks, one.n_stacks, folder), folder / "out"
     name = f"{one.weeks} weeks, {one.n_stacks} stacks, {one.preset}, {one.voxel_mm:g} mm"
     return {"limited": _limited_rows(case, name, _arguments_for(one, case, output), output)}
@@ -151,7 +152,7 @@ def is_kept(row: Row) -> bool:
 
 
 def limits_table(rows: Sequence[Row]) -> str:
-    """The rows in Markdown."""
+    """Markdown table of the runs with limits."""
 
     def given_up(row: Row) -> str:
         if "refused" in row:
@@ -174,7 +175,7 @@ def limits_table(rows: Sequence[Row]) -> str:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """The configurations, and those below limits."""
+    """Tasks for the configurations without limits, and for those with limits."""
     if options.part != "limits":
         yield from (Task(one.name, stated, (one, options.output)) for one in CONFIGURATIONS)
     if options.part != "statement":
@@ -182,13 +183,13 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def parts(record: Record) -> tuple[list[Row], list[Row]]:
-    """Rows of the statements, and rows below limits."""
+    """Rows of the runs without limits, and rows of the runs with limits."""
     rows = record["rows"].values()
     return [row for row in rows if "limited" not in row], [one for row in rows for one in row.get("limited", [])]
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Statements against measurements, and runs below limits; each where it was measured."""
+    """Table of stated against measured memory, and table of runs with limits; each only if measured."""
     columns: dict[str, Any] = {
         "phantom": "{weeks} weeks",
         "stacks": "{stacks}",
@@ -206,7 +207,7 @@ def tables(record: Record) -> dict[str, str]:
 
 
 def keeps_its_word(record: Record) -> bool:
-    """Whether no statement, and no limit, is below what was held, and none states too much."""
+    """Whether measured memory exceeds neither a statement nor a limit, and no statement is too high."""
     statements, limits = parts(record)
     ratios = [row["stated_bytes"] / row["measured_bytes"] for row in statements] or [1.0]
     return min(ratios) >= 1 and max(ratios) <= record["most"] and all(map(is_kept, limits))

@@ -1,7 +1,7 @@
 """A small phantom case of the size that other methods were timed on: `python -m studies.tradeoff.peer_phantom`.
 
-A truth of 64^3 voxels of 0.8 mm and three stacks of 58 x 58 x 18 pixels of 0.8 x 0.8 x 2.4 mm, every slice at
-a pose of its own: the built-in phantom, shrunk until it fits.
+It is the built-in phantom, shrunk to fit: a truth of 64^3 voxels of 0.8 mm and three stacks of 58 x 58 x 18 pixels of
+0.8 x 0.8 x 2.4 mm, in which every slice has its own pose.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from studies.harness import FOLDER
 from studies.subjects import BRIGHT
 
 WEEKS = 18.0
-"""The youngest that there is: heads of this size are as young, and as smooth."""
+"""The youngest age of the phantom, since heads of this size are as young and as smooth."""
 
 VOXELS, VOXEL_MM = 64, 0.8
 STACK_SHAPE, PIXEL_MM, THICKNESS_MM = (58, 58, 18), 0.8, 2.4
 LENGTH_MM = 42.0
-"""Longest axis of the head: it fits the stacks with two pixels to spare."""
+"""Longest axis of the head, which fits into the stacks with two pixels to spare."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -66,10 +66,10 @@ def _write_case(folder: Path, seed: int, *, replace_it: bool) -> None:
 
 
 def small_head(seed: int) -> TruthVolume:
-    """The phantom with its longest axis as long as wanted, on a cube of voxels."""
+    """The phantom scaled to a longest axis of `LENGTH_MM`, on a cube of voxels."""
     wide = fetal_brain_phantom(WEEKS, VOXEL_MM, seed)
     extent_mm = (np.ptp(np.argwhere(wide.mask), axis=0) + 1).max() * VOXEL_MM
-    # made with voxels so large that, called small ones, they make a small head: nothing is resampled
+    # made with larger voxels, whose size is then stated as VOXEL_MM: this shrinks the head without resampling
     made = fetal_brain_phantom(WEEKS, VOXEL_MM * extent_mm / LENGTH_MM, seed)
     low = [(n - VOXELS) // 2 for n in made.mask.shape]
     bright = np.float32(BRIGHT / np.percentile(made.t2[made.mask], 99.5))
@@ -82,7 +82,7 @@ def small_head(seed: int) -> TruthVolume:
 
 
 def in_shape(one: SimulatedStack) -> SimulatedStack:
-    """A stack cut or filled with zeros, about its middle, to the wanted number of pixels; its slices are cut alone."""
+    """A stack cropped or zero-padded about its centre to `STACK_SHAPE`; slices are only cropped, never added."""
     stack = one.stack
     low = [(n - wanted) // 2 for n, wanted in zip(stack.image.shape, STACK_SHAPE, strict=True)]
     first, last = max(0, low[2]), min(stack.image.shape[2], low[2] + STACK_SHAPE[2])

@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.pose_rounds`: what rounds of poses and volume bring, on one registration."""
+"""`python -m studies.tradeoff.pose_rounds`: gain by rounds of poses and volume, on one registration."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ ROUNDS = (0, 1, 2)
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case and number of its stacks, all numbers of rounds in it."""
+    """One task per case and number of its stacks, which measures all numbers of rounds."""
     for folder in case_folders(options.cases):
         for n_stacks in range(1, len(read_case(folder).stacks) + 1):
             yield Task(f"{folder.name}, {n_stacks}", measure, (folder, n_stacks, options))
 
 
 def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
-    """The first stacks of a case with each number of rounds.
+    """Measure the first stacks of a case with each number of rounds.
 
     Args:
         folder: of the case.
-        n_stacks: how many of its stacks.
+        n_stacks: number of its stacks to use.
         options: of the command.
     """
     case = read_case(folder, n_stacks)
@@ -52,7 +52,7 @@ def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case."""
+    """Progress line of a finished case."""
     return f"{key}: " + ", ".join(f"{n} rounds {found['psnr_db']:.2f}" for n, found in row["volume"].items())
 
 
@@ -63,7 +63,7 @@ def tables(record: Record) -> dict[str, str]:
         columns |= {f"{title}, {n} rounds": f"{{{name}[{n}]{form}}}" for n in ROUNDS}
     columns |= {f"poses, mm, {n} rounds": f"{{poses_mm[{n}]:.2f}}" for n in ROUNDS}
     columns["kept of 2"] = "{kept[2]}"
-    # a format takes digits in brackets for a number
+    # a format would read digits in brackets as a list index
     parts = ("volume", "prior", "poses_mm", "kept")
     rows = [row | {part: _by_number(row[part]) for part in parts} for row in record["rows"].values()]
     return {"pose-rounds": f"Preset `{record['preset']}`, weights {record['weights']}.\n\n{table(rows, columns)}"}

@@ -22,10 +22,11 @@ from studies.tradeoff.presets_figure import draw_presets
 FIRST_SEED = 64_000
 
 HEADS = ("crl-sta/sta24", "crl-sta/sta34", "spina-bifida/sb33-operated", "spina-bifida/sb34-operated")
-"""Neither trained on nor looked at when settings were chosen. The `sta` heads have neighbours in the training data."""
+"""Heads that were neither trained on nor looked at when settings were chosen. Weeks next to those of the `sta` heads
+are in the training data."""
 
 SIZES = ((0.7, 3.0, 0.0), (1.0, 2.5, 0.0), (1.1, 3.0, 0.3), (1.3, 4.0, 0.0))
-"""Pixels, thickness and gap in mm."""
+"""Pixel size, slice thickness and gap in mm."""
 
 MOTIONS = ("moderate", "mild")
 
@@ -47,18 +48,18 @@ SUBJECTS = tuple(_subject(head, motion) for motion in range(len(MOTIONS)) for he
 TRADE = ("preview", "fast", "balanced", "accurate")
 
 FEWER_STACKS = "balanced"
-"""The preset in which two stacks and one are measured; two stacks in the most careful one, too."""
+"""Preset in which two stacks and one are measured; two stacks are also measured with `accurate`."""
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Those of all reconstructions whose key has a part that matches --cases."""
+    """The tasks of `all_tasks` whose key has a part that matches --cases."""
     for task in all_tasks(options):
         if any(fnmatch(task.key, f"*{pattern}*") for pattern in options.cases):
             yield task
 
 
 def all_tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A reconstruction each: quick presets of all subjects first."""
+    """One task per reconstruction, quick presets of all subjects first."""
     quick, careful = TRADE[:-1], TRADE[-1]
     wanted = (*((preset, 3) for preset in quick), (FEWER_STACKS, 2), (careful, 3), (FEWER_STACKS, 1), (careful, 2))
     for preset, n_stacks in wanted:
@@ -67,11 +68,11 @@ def all_tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(spec: SizedSubject, n_stacks: int, preset: str, options: argparse.Namespace) -> Row:
-    """One subject, reconstructed with its first stacks.
+    """Reconstruct one subject from its first stacks.
 
     Args:
         spec: the subject.
-        n_stacks: how many stacks.
+        n_stacks: number of its first stacks to use.
         preset: settings.
         options: of the command.
     """
@@ -101,7 +102,7 @@ def measure(spec: SizedSubject, n_stacks: int, preset: str, options: argparse.Na
 
 
 def line(key: str, row: Row) -> str:
-    """A finished reconstruction."""
+    """Progress line of a finished reconstruction."""
     scores = ", ".join(f"{name} {found['psnr_db']:.2f}" for name, found in row["scores"].items())
     return f"{key}: {scores} dB, poses {row['tre_mm']:.2f} mm, {row['seconds']:.0f} s"
 
@@ -124,14 +125,14 @@ def psnr_db(row: Row, name: str = "volume") -> float:
 
 
 def trade_table(rows: Mapping[str, Row]) -> str:
-    """A row per subject with all presets, three stacks."""
+    """Table for three stacks, a row per subject with all presets."""
     found = {preset: by_subject(rows, preset, 3) for preset in TRADE}
     lines = []
     for spec in SUBJECTS:
         cells: dict[str, Any] = {"name": spec.name, "size": f"{spec.pixel_mm:g} x {spec.thickness_mm:g}"}
         for preset, of_preset in found.items():
             if row := of_preset.get(spec.name):
-                cells["prior"] = f"{psnr_db(row, 'V_prior'):.2f}"  # of the most careful one
+                cells["prior"] = f"{psnr_db(row, 'V_prior'):.2f}"  # of the last preset that has one
                 cells |= {preset: f"{psnr_db(row):.2f}", f"{preset} s": f"{row['cpu_seconds']:.0f}"}
                 cells |= {f"{preset} poses": f"{row['tre_mm']:.2f}"}
         lines.append(cells)
@@ -145,7 +146,7 @@ def trade_table(rows: Mapping[str, Row]) -> str:
 
 
 def _gains(found: Mapping[str, Mapping[str, Row]]) -> dict[str, str]:
-    """Mean and least gain of each preset over the one before it."""
+    """Mean and smallest gain of each preset over the previous one."""
     gains = {}
     for quick, careful in pairwise(TRADE):
         both = sorted(set(found[quick]) & set(found[careful]))
@@ -156,7 +157,7 @@ def _gains(found: Mapping[str, Mapping[str, Row]]) -> dict[str, str]:
 
 
 def fewer_table(rows: Mapping[str, Row], wanted: Sequence[tuple[str, int]]) -> str:
-    """Two stacks or one: the volume beside V_prior and V_coarse.
+    """Table for two stacks or one: the volume compared with V_prior and V_coarse.
 
     Args:
         rows: of the record.
@@ -184,7 +185,7 @@ def fewer_table(rows: Mapping[str, Row], wanted: Sequence[tuple[str, int]]) -> s
 
 
 def tables(record: Record) -> dict[str, str]:
-    """The tables, and what they were measured on."""
+    """The tables, with their subjects and settings."""
     made = f"Weights {record['weights']}; CPU seconds of the reconstruction without start and files."
     return {
         "presets": f"{made}\n\n{trade_table(record['rows'])}",

@@ -1,4 +1,4 @@
-"""A figure of the trade: PSNR against CPU seconds, a curve for every subject."""
+"""Figure of PSNR against CPU seconds of the presets, a curve for every subject."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.slice_model`: what each part of the model of a slice brings, on one registration."""
+"""`python -m studies.tradeoff.slice_model`: gain by each part of the slice model, on one registration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WITHOUT: dict[str, Mapping[str, Any]] = {
     "less width in plane": {"slice_model.in_plane": 1.0},
     "prior in the volume": {"prior_weight": 0.0},
 }
-"""The parts, and the settings that leave each out."""
+"""The parts, with the settings that leave each out."""
 
 SHIPPED, NONE = "as shipped", "none of these"
 
@@ -34,13 +34,13 @@ VARIANTS: dict[str, Mapping[str, Any]] = {
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case, all its variants in it."""
+    """One task per case, which measures all variants."""
     for folder in case_folders(options.cases):
         yield Task(folder.name, measure, (folder, options))
 
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
-    """Every variant on one case.
+    """Measure every variant on one case.
 
     Args:
         folder: of the case.
@@ -60,7 +60,7 @@ def measure(folder: Path, options: argparse.Namespace) -> Row:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case."""
+    """Progress line of a finished case."""
     return f"{key}: " + ", ".join(f"{name} {found['psnr_db']:.2f}" for name, found in row["scores"].items())
 
 

@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.slice_profile`: what held-out slices find of slice profiles whose width is known."""
+"""`python -m studies.tradeoff.slice_profile`: estimation of slice profiles of known width by held-out slices."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from studies.subjects import SizedSubject, simulated_case
 from studies.tables import Cell, table
 
 PIXEL_MM, STATED_MM = 1.0, 3.0
-"""Pixels, and the thickness that the reconstruction is told."""
+"""Pixel size, and the thickness that is stated to the reconstruction."""
 
 HEADS = (("crl-sta/sta27", 72_001), ("crl-sta/sta31", 72_002))
 """Development heads, and the seed of each."""
@@ -37,7 +37,7 @@ SLICES: tuple[tuple[Profile, tuple[float, ...]], ...] = (
     ("gaussian", (0.75, 1.0, 1.25)),
     ("box", (1.25, 1.0, 0.75)),
 )
-"""Profile, and true thickness of each stack over the stated one."""
+"""Profile, and ratio of the true to the stated thickness of each stack."""
 
 ONE_FIT = {"pose_rounds.more_stacks": 0, "prior_views": 1, "share_probes": 1}
 
@@ -46,23 +46,23 @@ MODELS: dict[str, Mapping[str, Any]] = {
     "0.95": {"held_out": None},
     "found": {},
 }
-"""Changes of `balanced` on one registration: the profile as stated, as `fast` has it, and as held-out slices say."""
+"""Changes of `balanced` on one registration: profile as stated, as in `fast`, and as estimated by held-out slices."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProfiledSubject(SizedSubject):
-    """A subject whose slices are thicker or thinner than their distance.
+    """A subject whose slices are thicker or thinner than stated, with the slice spacing unchanged.
 
     Args:
         profile: through the slice.
-        true_width: thickness of each stack over `thickness_mm`.
+        true_width: ratio of the true thickness of each stack to `thickness_mm`.
     """
 
     profile: Profile
     true_width: tuple[float, ...]
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
-        """How its stacks are taken."""
+        """Acquisition settings of its stacks."""
         usual = super().acquisition(n_stacks)
         return [
             replace(
@@ -76,7 +76,7 @@ class ProfiledSubject(SizedSubject):
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per head and kind of slices."""
+    """One task per head and kind of slices."""
     for volume, seed in HEADS:
         for profile, widths in SLICES:
             name = "profile-" + "-".join([profile, *(f"{width:g}" for width in widths), str(seed)])
@@ -94,7 +94,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(spec: ProfiledSubject, options: argparse.Namespace) -> Row:
-    """Widths that are found, and the volume with and without them, on one registration.
+    """Estimated widths, and the volume with and without them, on one registration.
 
     Args:
         spec: of the subject.
@@ -121,18 +121,18 @@ def measure(spec: ProfiledSubject, options: argparse.Namespace) -> Row:
 
 
 def equivalent_width(profile: Profile, width: float) -> float:
-    """Width of the Gaussian of the same variance, over the nominal one of the stated thickness."""
+    """Width of the Gaussian of the same variance, relative to the nominal width for the stated thickness."""
     return float(FWHM_PER_SIGMA * profile_deviation(profile) * width)
 
 
 def line(key: str, row: Row) -> str:
-    """A finished subject."""
+    """Progress line of a finished subject."""
     scores = ", ".join(f"{name} {found['psnr_db']:.2f}" for name, found in row["scores"].items())
     return f"{key}: true {row['true']}, mean {row['mean']}, taken {row['taken']}; {scores} dB"
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A row per subject: true widths, the mean that was found, what was taken, and PSNR."""
+    """A row per subject: true widths, mean of the estimates, widths that were used, and PSNR."""
 
     def listed(widths: list[float] | None) -> str:
         return "not found" if widths is None else ", ".join(f"{width:.2f}" for width in widths)

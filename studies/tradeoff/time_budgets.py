@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.time_budgets`: whether --time-budget is kept, and what a longer one brings."""
+"""`python -m studies.tradeoff.time_budgets`: whether --time-budget is kept, and the gain by a longer budget."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from studies.tables import marked, table
 BUDGETS_S = (6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0, 120.0)
 
 MORE_SHARE, MORE_S = 0.1, 2.0
-"""By how much a budget may be exceeded."""
+"""Accepted excess over a budget: a share of it, and seconds."""
 
 MAX_LOSS_DB = 0.1
-"""By how much a longer budget may be worse than a shorter one."""
+"""Accepted loss with a longer budget compared with a shorter one."""
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every budget, case by case."""
+    """One task per budget, case by case."""
     for folder in chosen_folders(options.folders):
         for budget_s in sorted(options.budgets):
             thickness = options.thickness or THICKNESS_MM.get(folder.name)
@@ -37,7 +37,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 @functools.lru_cache(maxsize=1)
 def compiled(arguments: tuple[str, ...], output: Path) -> None:
-    """One run before those that count, so that kernels are compiled."""
+    """Run once before the measurement, so that the kernels are compiled."""
     run_infer(arguments, output)
 
 
@@ -48,7 +48,7 @@ def _spin() -> None:
 
 @contextmanager
 def one_core_busy() -> Iterator[None]:
-    """Another process takes one of the cores."""
+    """Keep one core busy with another process."""
     other = multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
     other.start()
     try:
@@ -64,12 +64,12 @@ def measure(folder: Path, budget_s: float, thickness_mm: float | None, output: P
     Args:
         folder: of the case.
         budget_s: the time budget in seconds.
-        thickness_mm: of the slices; None where the case records it.
+        thickness_mm: of the slices; None if the case records it.
         output: folder for the results.
     """
     case = load_case(folder, thickness_mm)
     plain = infer_arguments(case, "preview", output)
-    compiled(tuple(infer_arguments(case, "balanced", output)), output)  # which has kernels of all stages
+    compiled(tuple(infer_arguments(case, "balanced", output)), output)  # balanced uses the kernels of all stages
     at = plain.index("--preset")
     arguments = [*plain[:at], "--time-budget", f"{budget_s:g}", *plain[at + 2 :]]
     with one_core_busy():

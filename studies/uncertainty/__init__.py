@@ -1,1 +1,1 @@
-"""Stated uncertainty against error: calibration and check (docs/prior.md)."""
+"""Calibration and check of the stated uncertainty against the error (docs/prior.md)."""

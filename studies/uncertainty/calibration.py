@@ -21,12 +21,12 @@ from studies.uncertainty.judgement import check_record, check_text
 
 
 def model_name(options: argparse.Namespace) -> str:
-    """Which of the two sets of coefficients is meant."""
+    """Name of the set of coefficients: with or without prior."""
     return WITHOUT_PRIOR if options.no_prior else WITH_PRIOR
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """One: the coefficients, or the judgement of them."""
+    """One task: the fit of the coefficients, or their check."""
     if options.task == "fit":
         yield Task(f"fit, {model_name(options)}", fit, (options,))
     else:
@@ -34,7 +34,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def reconstructed(options: argparse.Namespace, *, fitting: bool) -> list[Judged]:
-    """Every subject, voxel by voxel; of the check also one that is not registered."""
+    """Predictors and errors of every subject, voxel by voxel; for the check also of one without registration."""
     settings = replace(PRESETS[options.preset], use_prior=not options.no_prior)
     reconstructor = GaussianReconstructor(options.ckpt, settings)
     subjects = (FIT_SUBJECTS if fitting else CHECK_SUBJECTS)[: options.subjects]
@@ -56,7 +56,7 @@ def reconstructed(options: argparse.Namespace, *, fitting: bool) -> list[Judged]
 
 
 def fit(options: argparse.Namespace) -> Row:
-    """Fit the coefficients, every subject counting the same; write them into the package."""
+    """Fit the coefficients with equal weight for every subject, and write them into the package."""
     found = reconstructed(options, fitting=True)
     of_each = [terms(one.predictors) for one in found]
     samples = {name: np.concatenate([one[name] for one in of_each]) for name in of_each[0]}
@@ -86,38 +86,38 @@ def fit(options: argparse.Namespace) -> Row:
 
 
 def check(options: argparse.Namespace) -> Row:
-    """Check the shipped coefficients on subjects that they were not fitted to."""
+    """Check the shipped coefficients on subjects to which they were not fitted."""
     found = reconstructed(options, fitting=False)
     judgement = check_record(found, calibration()[model_name(options)])
     return {"preset": options.preset, "weights": _weights(options), **judgement}
 
 
 def line(key: str, row: Row) -> str:
-    """The coefficients."""
+    """Progress line with the coefficients."""
     parts = [f"ln u = {row['intercept']:.3f}", *(f"  + {b:.3f} {name}" for name, b in row["coefficients"].items())]
     written = f", written to {CALIBRATION.name}" if key.startswith("fit") else ""
     return "\n".join([f"{key}{written}:", *parts])
 
 
 def checked(record: Record) -> dict[str, Row]:
-    """The judgements of the record, with and without prior."""
+    """The checks in the record, with and without prior."""
     return {name: record["rows"][name] for name in (WITH_PRIOR, WITHOUT_PRIOR) if name in record["rows"]}
 
 
 def tables(record: Record) -> dict[str, str]:
-    """The judgement, where there was one."""
+    """The tables of the check, if there was one."""
     found = checked(record)
     return {"uncertainty": check_text(found)} if found else {}
 
 
 def draw(record: Record, options: argparse.Namespace) -> None:
-    """Error against uncertainty, of the check."""
+    """Draw error against uncertainty of the check."""
     if options.task == "check":
         draw_calibration(record["rows"][model_name(options)], options.figure)
 
 
 def _weights(options: argparse.Namespace) -> str | None:
-    """Which prior the figures belong to."""
+    """The weights of the prior that was used, if any."""
     return None if options.no_prior else weights(options.ckpt)
 
 

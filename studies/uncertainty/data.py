@@ -30,7 +30,7 @@ from studies.tables import stacks
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """A subject, the number of its stacks that are used, and what they miss."""
+    """A subject, the number of its stacks to use, and their holes."""
 
     spec: SubjectSpec
     n_stacks: int
@@ -38,7 +38,7 @@ class Subject:
 
     @property
     def label(self) -> str:
-        """For tables: name, number of stacks, and whether something is missing."""
+        """Label in tables: name, number of stacks, and whether slices are missing."""
         missing = ", slices missing" if self.holes else ""
         return f"{self.spec.name}, {stacks(self.n_stacks)}{missing}"
 
@@ -68,9 +68,9 @@ FIT_SUBJECTS = [
     _subject("crl-sta/sta24", 3, "moderate", 51_212, *_in_each(0.0, 0.25)),
     _subject("crl-sta/sta24", 1, "none", 51_213, Hole(0, 0.4, n_slices=5)),
 ]
-"""Volume, stacks, motion, seed and missing slices of the subjects that the coefficients are fitted to. No prior was
-trained on these volumes (checkpoints are chosen by operated ones). The last four are of the atlas that the template is
-mostly made of: what it puts into a hole is twice as good there as in heads with spina bifida, and users have both."""
+"""Volume, stacks, motion, seed and holes of the subjects to which the coefficients are fitted. No prior was trained on
+these volumes (checkpoints are chosen on operated volumes). The last four come from the atlas that makes up most of the
+template, which fills their holes twice as well as those of heads with spina bifida; users have heads of both kinds."""
 
 CHECK_SUBJECTS = [
     _subject("crl-sta/sta30", 3, "mild", 52_210),
@@ -84,10 +84,11 @@ CHECK_SUBJECTS = [
     _subject("crl-sta/sta34", 3, "mild", 52_208),
     _subject("crl-sta/sta30", 1, "mild", 52_219, Hole(0, 0.6, n_slices=2)),
 ]
-"""Subjects that the coefficients are checked on: weeks excluded from every training and choice."""
+"""Subjects of the check: weeks excluded from every training and choice."""
 
 UNREGISTERED = _subject("crl-sta/sta30", 3, "moderate", 52_260)
-"""One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
+"""Additional subject of the check, reconstructed from the headers without registration, to see whether the uncertainty
+map shows the resulting errors."""
 
 NO_REGISTRATION = {
     "registration.template": False,
@@ -106,16 +107,16 @@ class Judged:
     """One reconstruction, voxel by voxel.
 
     Attributes:
-        subject: which, from how many stacks, what they miss.
-        predictors: [n] by name, a random choice of the voxels inside both masks.
-        unseen: [n] voxels that no slice saw.
+        subject: the subject.
+        predictors: [n] by name, at a random choice of voxels inside both masks.
+        unseen: [n] whether a voxel is unseen.
         error: [n] volume minus truth, in normalised intensities.
         psnr_db: of the volume.
-        median_mm: error of the poses.
+        median_mm: median pose error.
         reliable: whether the record calls the registration reliable.
-        registered: whether there was one.
-        seconds: of reconstruction and comparison; registration comes from the cache.
-        map_seconds: of the map alone, processor time.
+        registered: whether slices were registered.
+        seconds: for reconstruction and comparison, without the cached registration.
+        map_seconds: CPU time for the map alone.
     """
 
     subject: Subject
@@ -139,7 +140,7 @@ def judged(subject: Subject, reconstructor: GaussianReconstructor, cache: Path, 
     """Simulate, register (or take that from the cache), reconstruct and compare with the truth.
 
     Args:
-        subject: which, from how many stacks, what they miss.
+        subject: the subject.
         reconstructor: with or without prior.
         cache: folder of simulated subjects and their registrations.
         registered: False reconstructs from the headers.
@@ -177,22 +178,22 @@ def judged(subject: Subject, reconstructor: GaussianReconstructor, cache: Path, 
 def relative_error(
     volume: NDArray[np.float32], truth: NDArray[np.float32], mask: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Volume minus truth, the truth brought to the volume's mean in the mask.
+    """Volume minus truth, with the truth scaled to the volume's mean in the mask.
 
-    One factor, since the scale of a reconstruction is arbitrary. The gain and offset that `g3r-evaluate` fits
-    would hide errors: of a volume that has nothing to do with the truth they leave its mean.
+    A single factor is used because the scale of a reconstruction is arbitrary. The gain and offset that `g3r-evaluate`
+    fits would hide errors: they reduce a volume that is unrelated to the truth to its mean.
 
     Args:
         volume: [I, J, K] of the reconstruction.
         truth: [I, J, K] on the same grid.
-        mask: [I, J, K] where both are known.
+        mask: [I, J, K] voxels where both are known.
     """
     factor = float(volume[mask].mean()) / float(truth[mask].mean())
     return volume.astype(np.float64) - factor * truth
 
 
 def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
-    """Predictors of the map of a result."""
+    """Predictors of the uncertainty map of a result."""
     scale = np.float32(result.intensity_scale)
     fit = SliceFit(
         cloud=result.cloud,

@@ -1,4 +1,4 @@
-"""The figure of the calibration: error against stated uncertainty, and what leaving voxels out brings."""
+"""Figure of the calibration: error against stated uncertainty, and sparsification curves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def draw_calibration(record: Mapping[str, Any], path: Path) -> None:
 
     Args:
         record: of `check_record`.
-        path: PNG to write, whole or not at all.
+        path: PNG to write, atomically.
     """
     numbers = [int(n) for n in record["by_stacks"]]
     figure = new_figure((4.3 * (len(numbers) + 1), 4.3))
@@ -31,7 +31,7 @@ def draw_calibration(record: Mapping[str, Any], path: Path) -> None:
 
 
 def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
-    """Mean and root-mean-square error of ten groups of voxels against what was stated for them."""
+    """Draw mean and root-mean-square error of ten groups of voxels against their stated uncertainty."""
     colour = COLOURS.get(n, "#4a4a4a")
     of_n = [one for one in record["subjects"].values() if one["n_stacks"] == n and one["registered"]]
     for k, one in enumerate(of_n):
@@ -62,7 +62,7 @@ def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
 
 
 def _sparsification(panel: Any, record: Mapping[str, Any]) -> None:
-    """Mean error of the voxels kept, relative to that of all."""
+    """Draw the mean error of the voxels that are kept, relative to the mean error of all voxels."""
     removed = 100 * REMOVED_SHARES
     for n, one in record["by_stacks"].items():
         colour = COLOURS.get(int(n), "#4a4a4a")

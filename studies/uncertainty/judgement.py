@@ -1,4 +1,4 @@
-"""Stated uncertainty against error: calibration in bins, coverage, ranking; as record and as table."""
+"""Comparison of stated uncertainty with error: calibration in bins, coverage, ranking; as record and as table."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ EXPONENTIAL_COVERAGE = tuple(1 - np.exp(-np.array(COVERAGE_FACTORS)))
 """Coverage of exponentially distributed errors."""
 
 MIN_VOXELS = 100
-"""Parts of a brain with fewer voxels are not judged."""
+"""Least number of voxels of a part of the brain that is judged."""
 
 REMOVED_SHARES = np.linspace(0, 0.95, 20)
 """Shares of the most uncertain voxels removed, for the sparsification curve."""
 
 
 def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
-    """Figures of every subject, and of all with the same number of stacks together."""
+    """Figures of every subject, and of all subjects with the same number of stacks together."""
     stated = [model.expected(one.predictors) for one in found]
     subjects = {
         one.label: {
@@ -62,11 +62,10 @@ def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, A
 
     Returns:
         `mean_stated`, `mean_error`; `coverage`: share of voxels whose error is under 1, 2 and 3 times the
-        stated; `spearman`: rank correlation; `gain_over_constant`: share of the way from a constant to the
-        true order by which the mean error of the voxels kept falls as the most uncertain are removed (area
-        under the sparsification curve; 0 for a constant, 1 for the errors themselves); `bins`: ten equally
-        large groups by the stated value, each its mean `stated`, `mean_error` and `rms_error`;
-        `sparsification`: the curves.
+        stated one; `spearman`: rank correlation; `gain_over_constant`: area between the sparsification curve (mean
+        error of the voxels kept as the most uncertain are removed) and that of a constant, relative to the same
+        area for the true order (0 for a constant, 1 for the errors themselves); `bins`: ten equally large groups
+        by the stated value, with their mean `stated`, `mean_error` and `rms_error`; `sparsification`: the curves.
     """
     from scipy.stats import spearmanr
 
@@ -95,14 +94,14 @@ def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, A
 
 
 def sizes(stated: NDArray[np.float64], size: NDArray[np.float64], chosen: NDArray[np.bool_]) -> dict[str, float] | None:
-    """Mean stated and found size [n] of the errors of some voxels; None of fewer than `MIN_VOXELS`."""
+    """Mean stated and actual size of the errors of chosen voxels; None for fewer than `MIN_VOXELS`."""
     if chosen.sum() < MIN_VOXELS:
         return None
     return {"mean_stated": float(stated[chosen].mean()), "mean_error": float(size[chosen].mean())}
 
 
 def sparsification(by: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean error of the voxels that are kept as those with the largest `by` are removed [20]."""
+    """Sparsification curve [20]: mean error of the remaining voxels as those with the largest `by` are removed."""
     total = np.cumsum(size[np.argsort(by, kind="stable")])
     n_kept = np.maximum(np.round((1 - REMOVED_SHARES) * len(size)).astype(int), 1)
     return np.asarray(total[n_kept - 1] / n_kept, dtype=np.float64)

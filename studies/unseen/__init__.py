@@ -1,1 +1,1 @@
-"""What docs/unseen.md shows: parts of a head that no slice saw."""
+"""Unseen parts of a head: the tables of docs/unseen.md."""

@@ -1,4 +1,4 @@
-"""`python -m studies.unseen.cases`: cases of the test data of which slices were emptied."""
+"""`python -m studies.unseen.cases`: cases of the test data with slices removed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from studies.unseen.measurement import EACH, line, measured
 
 @dataclass(frozen=True, kw_only=True)
 class HoledCase:
-    """A case of the test data, the stacks of it that are used, and what they miss."""
+    """A case of the test data, the number of its stacks to use, and their holes."""
 
     case: str
     n_stacks: int
@@ -31,17 +31,17 @@ CASES = {
         case="sta30-moderate", n_stacks=3, holes=(Hole(0, 0.3, 0.6), Hole(1, 0.3, 0.6), Hole(2, 0.35, 0.65))
     ),
 }
-"""Settings were chosen while looking at all of them."""
+"""Cases, all of which were looked at while settings were chosen."""
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per case."""
+    """One task per case."""
     for name, chosen in CASES.items():
         yield Task(name, measure, (chosen, options))
 
 
 def measure(chosen: HoledCase, options: argparse.Namespace) -> Row:
-    """One case.
+    """Reconstruct one case and score its seen and unseen brain.
 
     Args:
         chosen: with its holes.
@@ -52,7 +52,7 @@ def measure(chosen: HoledCase, options: argparse.Namespace) -> Row:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """A row per case; what wrong poses cost is the difference of the last column."""
+    """A row per case; the difference to the last column is the loss by wrong poses."""
     named = ({"name": f"{CASES[name].case}: {name}", **row} for name, row in record["rows"].items())
     return {"unseen-cases": table(named, {**EACH, "whole dB, true poses": "{at_true_poses[whole]:.2f}"})}
 

@@ -1,4 +1,4 @@
-"""Ways to fill what no slice saw, for comparison: none, harmonic, template, the prior and the volume."""
+"""Fills of the unseen part, for comparison: none, harmonic, template, V_prior and the volume."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from g3r.prior.model import Prior
 from g3r.registration import Registration
 
 FILLS = ("nothing", "harmonic", "template", "V_prior", "volume")
-"""In the order of the table; the last is what the product writes."""
+"""Fills in the order of the table; the last is the written volume of the product."""
 
 
 def harmonic(values: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The volume with its unknown voxels solved from Laplace's equation, the known ones around them given.
+    """The volume with its unknown voxels filled by Laplace's equation from the known voxels around them.
 
     Args:
         values: [I, J, K].
@@ -48,7 +48,7 @@ def harmonic(values: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray
 def filled_volumes(
     poses: Registration, prior: Prior, voxel_mm: float
 ) -> tuple[dict[str, NDArray[np.float32]], InitialVolumes]:
-    """The slices' own volume with the unseen part filled in each way but the last two, and what it was made from.
+    """The volume of the slices alone with each fill but the last two, and the initial volumes it was made from.
 
     Args:
         poses: of the slices.

@@ -1,4 +1,4 @@
-"""One head of which part was never seen: reconstructed, and seen and unseen brain compared with the truth."""
+"""Reconstruction of a head with an unseen part, and comparison of seen and unseen brain with the truth."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from studies.tables import Cell
 from studies.unseen.fills import FILLS, filled_volumes
 
 MIN_VOXELS = 100
-"""Parts of a brain with fewer voxels are not scored."""
+"""Least number of voxels of a part of the brain that is scored."""
 
 
 def measured(case: SimulatedCase, options: argparse.Namespace, *, true_poses: bool = False) -> Row:
     """Reconstruct a case, and score seen and unseen brain of every fill.
 
     Args:
-        case: with the stacks as they are to be used.
-        options: of the command; preset and prior count.
-        true_poses: whether to reconstruct from the true poses, too, which tells what wrong ones cost.
+        case: with the stacks to use.
+        options: of the command; preset and prior are used.
+        true_poses: whether to reconstruct from the true poses too, to measure the loss by wrong poses.
     """
     reconstructor = GaussianReconstructor(options.ckpt, PRESETS[options.preset])
     start = time.perf_counter()
@@ -75,7 +75,7 @@ def measured(case: SimulatedCase, options: argparse.Namespace, *, true_poses: bo
 
 
 def at_true_poses(case: SimulatedCase, found: Registration) -> Registration:
-    """A registration whose slices are where they were truly taken, in the frame that it found; unknown ones stay.
+    """A registration with the true poses of its slices, in the frame that it found; unknown poses are unchanged.
 
     Args:
         case: with the true poses.
@@ -130,7 +130,7 @@ def scored(
 
 
 def calibration_ratio(case: SimulatedCase, result: ReconstructionResult, common: RigidPose) -> dict[str, float]:
-    """Stated expected error over the true mean error, in the seen and in the unseen part of the result.
+    """Ratio of stated to true mean error, in the seen and in the unseen part of the result.
 
     Args:
         case: with the truth.
@@ -156,7 +156,7 @@ def calibration_ratio(case: SimulatedCase, result: ReconstructionResult, common:
 
 
 def line(key: str, row: Row) -> str:
-    """A finished case."""
+    """Progress line of a finished case."""
     unseen = ", ".join(f"{name} {row['scores'][name].get('unseen', float('nan')):.1f}" for name in FILLS)
     return (
         f"{key}: {row['unseen_share']:.1%} unseen, TRE {row['median_mm']:.2f} mm, brain {row['volume_error']:+.1%}, "

@@ -1,4 +1,4 @@
-"""`python -m studies.unseen.sweep`: heads of which part was never seen, reconstructed and compared with the truth."""
+"""`python -m studies.unseen.sweep`: heads with an unseen part, reconstructed and compared with the truth."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ VOLUMES = (
     "spina-bifida/sb27-operated",
     "spina-bifida/sb31-operated",
 )
-"""None was trained on; checkpoints were chosen by operated ones."""
+"""Volumes that were not used for training; checkpoints were chosen on operated volumes."""
 
 FIRST_SEED, DEVELOPMENT_SEED = 63_000, 62_000
-"""Seeds from the first belong to the published table; from the second they may be looked at before."""
+"""First seeds of the published table, and of subjects that may be looked at during development."""
 
 N_SUBJECTS = 20
 GOOD_VOLUME = 0.03
-"""Error of the brain's volume, as a share, that is good."""
+"""Largest good relative error of the brain's volume."""
 
 
 def hole_of(n: int, rng: np.random.Generator) -> tuple[int, tuple[Hole, ...]]:
-    """Number of stacks of subject n, and what they miss: nothing, runs of 1 to 8 slices, or fields of view that end.
+    """Number of stacks of subject n, and their holes: none, runs of 1 to 8 slices, or fields of view that end.
 
     Args:
         n: number of the subject.
@@ -57,7 +57,7 @@ def hole_of(n: int, rng: np.random.Generator) -> tuple[int, tuple[Hole, ...]]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per subject."""
+    """One task per subject."""
     seed = DEVELOPMENT_SEED if options.development else FIRST_SEED
     for n in range(options.subjects):
         spec = SubjectSpec(volume=VOLUMES[n % len(VOLUMES)], motion=("mild", "moderate")[(n // 2) % 2], seed=seed + n)
@@ -70,8 +70,8 @@ def measure(spec: SubjectSpec, n_stacks: int, holes: tuple[Hole, ...], options: 
 
     Args:
         spec: the subject.
-        n_stacks: of its stacks.
-        holes: what they miss.
+        n_stacks: number of its stacks to use.
+        holes: missing slices.
         options: of the command.
     """
     case = simulated_case(spec, options.cache, n_stacks)
@@ -80,7 +80,7 @@ def measure(spec: SubjectSpec, n_stacks: int, holes: tuple[Hole, ...], options: 
 
 
 def tables(record: Record) -> dict[str, str]:
-    """What holds of all subjects, and each."""
+    """Summary of all subjects, then a row for each."""
     rows = list(record["rows"].values())
     n = len(rows)
     good_volume = sum(abs(row["volume_error"]) <= GOOD_VOLUME for row in rows)
@@ -108,7 +108,7 @@ def tables(record: Record) -> dict[str, str]:
 
 
 def draw(record: Record, options: argparse.Namespace) -> None:
-    """PSNR of the unseen part by fill, a line per subject."""
+    """Draw PSNR of the unseen part by fill, a line per subject."""
     rows = [row for row in record["rows"].values() if "unseen" in row["scores"]["volume"]]
     figure = new_figure((6.4, 4.2))
     panel = figure.subplots()

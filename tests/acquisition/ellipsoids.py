@@ -1,4 +1,4 @@
-"""Stacks of an ellipsoid, for the tests of the mask that slices vote for."""
+"""Stacks of an ellipsoid, for the tests of the foreground."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ TURNS = (np.eye(3), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([[0
 
 
 def depth(world: np.ndarray) -> np.ndarray:
-    """1 at the ellipsoid's middle, 0 on its surface."""
+    """1 at the ellipsoid's centre, 0 on its surface."""
     return 1 - np.linalg.norm(world / RADII_MM, axis=-1)
 
 
@@ -48,7 +48,7 @@ def ellipsoid_stack(
 
 
 def without(stack: Stack, low_mm: float, high_mm: float) -> Stack:
-    """The stack with blank slices between two heights along its third axis."""
+    """The stack with blank slices between two heights along its third axis (mm)."""
     height = (
         stack.affine[:3, 2]
         / stack.spacing_mm[2]
@@ -62,7 +62,7 @@ def without(stack: Stack, low_mm: float, high_mm: float) -> Stack:
 
 
 def foreground_mask(slices: Slices, weight: np.ndarray | None = None) -> np.ndarray:
-    """The brain mask where no network tells of unseen voxels."""
+    """The foreground mask without a network for unseen voxels."""
     return foreground(slices, GRID, weight).support()
 
 

@@ -1,4 +1,4 @@
-"""Small images and masks on any axes, as arrays and as files."""
+"""Small images and masks with any order of axes, as arrays and as files."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def affine_of(
 
 
 def arrays(seed: int = 0, shape: tuple[int, int, int] = (14, 11, 6)) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct values, so that a value tells its voxel, and a ragged mask off the middle."""
+    """Distinct values, which identify each voxel, and an irregular off-centre mask."""
     rng = np.random.default_rng(seed)
     image = (1 + rng.permutation(np.prod(shape))).reshape(shape).astype(np.float32)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1)

@@ -1,4 +1,4 @@
-"""The size and the middle of a head are right although slices of it are missing."""
+"""Size and centre of a head are estimated correctly although slices are missing."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def whole() -> Slices:
 
 
 def without(slices: Slices, stack: int, first: float, last: float) -> Slices:
-    """Without the slices of a stack between two fractions of its own."""
+    """The slices without those of one stack between two fractions of its length."""
     rows = np.flatnonzero(slices.stack_id == stack)
     lost = rows[round(first * len(rows)) : round(last * len(rows))]
     return slices.take(np.setdiff1d(np.arange(len(slices)), lost))

@@ -1,4 +1,4 @@
-"""Resampling along axes: exact on straight lines, an average where it gets coarser, zero beyond."""
+"""Resampling along axes: exact on linear ramps, averaging at coarser spacing, zero beyond the samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def test_straight_lines_stay(new_mm: float) -> None:
     at = np.arange(12.0, 40.0, new_mm)
     weights = axis_weights(50, 1.1, at, new_mm)
     np.testing.assert_allclose(weights.sum(1), np.ones(len(at)), atol=1e-6)
-    # the hat is symmetric about a new sample, the old ones are not: at most a part of their distance
+    # the hat is symmetric about a new sample but the old samples are not: the error is a fraction of their distance
     off = np.abs(weights @ (np.arange(50) * 1.1) - at)
     assert off.max() < (0.1 * 1.1 if new_mm > 1.1 else 1e-4)
 

@@ -1,4 +1,4 @@
-"""Stacks that need no mask, and those that are refused without one."""
+"""Stacks that need no mask, and stacks that are refused without a mask."""
 
 from __future__ import annotations
 

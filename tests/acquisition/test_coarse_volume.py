@@ -1,4 +1,4 @@
-"""M_rho is 1 where one gapless stack covers once; V_coarse is a mean; confidence keeps its digits."""
+"""M_rho is 1 in one gapless stack, V_coarse is a weighted mean, and small confidences keep their precision."""
 
 from typing import Any
 
@@ -40,7 +40,7 @@ def cube_stack(
 
 
 def density_inside(slices: Slices, voxel_mm: float = 1.0, **options: Any) -> np.ndarray:
-    """M over the inner cube of 24 mm, whole periods of every slice distance in use."""
+    """M over the inner cube of 24 mm, which holds whole periods of every slice spacing in use."""
     grid = VolumeGrid.isotropic([-12 + voxel_mm / 2] * 3, [12 - voxel_mm / 2] * 3, voxel_mm)
     return coarse_and_density(slices, grid, **options)[1]
 
@@ -49,7 +49,7 @@ def density_inside(slices: Slices, voxel_mm: float = 1.0, **options: Any) -> np.
 def test_one_gapless_stack_counts_once(turn: str) -> None:
     density = density_inside(slices_from_stacks([cube_stack(turn=TURNS[turn])]))
     assert density.mean() == pytest.approx(1, abs=0.01)
-    # slices with FWHM = distance ripple by 2 exp(-2 pi^2 / 2.3548^2) = 5.7 %
+    # slices with FWHM = spacing ripple by 2 exp(-2 pi^2 / 2.3548^2) = 5.7 %
     assert density.min() > 0.93
     assert density.max() < 1.07
 
@@ -140,7 +140,7 @@ def test_confidence_at_its_ends() -> None:
     density = np.array([0.0, 1e-30, 1e-8, 1.0, 3.0, 1e6])
     found = confidence(density)
     assert found[0] == 0
-    assert found[1] == 1e-30  # 1 - exp(-M) would have lost it
+    assert found[1] == 1e-30  # 1 - exp(-M) would be zero in floating point
     assert found[2] == pytest.approx(1e-8, rel=1e-8)
     np.testing.assert_allclose(found[3:5], [0.63212, 0.95021], atol=1e-5)
     assert found[5] == 1

@@ -1,4 +1,4 @@
-"""The bias field that all stacks share: found where there is one, left alone where there is none."""
+"""The common bias field: found if there is one, and not invented if there is none."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def field(strength: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found() -> np.ndarray:
-    """What is found of a field of strength 0.1."""
+    """The estimate of a field of strength 0.1."""
     return common_log_field((tissues() * np.exp(field(0.1))).astype(np.float32), BRAIN, GRID)
 
 

@@ -1,4 +1,4 @@
-"""How densely whole slices sample space: as Eq. 6 integrated by brute force, and whatever the masks say."""
+"""Density of whole slices: equal to brute-force integration of Eq. 6, and independent of the masks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def stack(
     masked: tuple[slice, ...] = ALL,
     dark: slice = slice(0, 0),
 ) -> Stack:
-    """A stack about the origin, of which a box is masked and some slices are blank."""
+    """A stack about the origin with a box as mask and some blank slices."""
     spacing = np.array([*pixel_mm, thickness_mm if distance_mm is None else distance_mm])
     affine = np.eye(4)
     affine[:3, :3] = (np.eye(3) if turn is None else turn) * spacing
@@ -42,7 +42,7 @@ def stack(
 
 
 def shaken(slices: Slices) -> Slices:
-    """The slices each in another oblique pose."""
+    """The slices, each in a different oblique pose."""
     turn = Rotation.from_euler("xyz", [35, -20, 50], degrees=True) * Rotation.from_rotvec(
         0.1 * np.random.default_rng(0).standard_normal((len(slices), 3))
     )
@@ -77,7 +77,7 @@ def test_it_is_the_integral_of_eq_6_edges_included() -> None:
     whole = slices_from_stacks([stack((9, 12, 6), masked=(slice(1, 6), slice(2, 9), slice(None)))])
     slices = shaken(whole.take(np.array([0, 2, 3])))
     expected = integrated(slices, at_voxels(GRID)).reshape(GRID.shape)
-    # a test that looks at inside, outside and edges of the fields of view
+    # the points lie inside, outside and at the edges of the fields of view
     assert ((expected > 0.1) & (expected < 0.5)).sum() > 300
     assert (expected > 0.8).sum() > 100
     assert (expected < 1e-6).sum() > 300
@@ -97,7 +97,7 @@ def test_one_gapless_stack_covers_once(pixel_mm: tuple[float, float], thickness_
     masked = (slice(3, 20), slice(5, 19), slice(4, 8))
     slices = slices_from_stacks([stack(shape, pixel_mm=pixel_mm, thickness_mm=thickness_mm, turn=turn, masked=masked)])
     density = coverage(slices, VolumeGrid.isotropic([-6] * 3, [6] * 3, voxel_mm))
-    # Gaussians of this width at this distance ripple by 5.7 %
+    # Gaussians of this width at this spacing ripple by 5.7 %
     assert density.mean() == pytest.approx(1, abs=0.01)
     assert 0.94 < density.min() <= density.max() < 1.06
     gap = slices_from_stacks(
@@ -127,7 +127,7 @@ def height_profile(slices: Slices) -> np.ndarray:
 
 
 NEIGHBOUR = 0.939 * np.exp(-0.5 * 2.3548**2)
-"""What a slice adds at the centre of the next one: a sixteenth."""
+"""Contribution of a slice to the density at the centre of the next slice: a sixteenth."""
 
 
 def test_blank_and_unmasked_slices_within_do_not_cover() -> None:
@@ -136,7 +136,7 @@ def test_blank_and_unmasked_slices_within_do_not_cover() -> None:
     blank = height_profile(slices_from_stacks([stack(dark=slice(4, 6))]))
     np.testing.assert_allclose(blank[4:6], NEIGHBOUR, atol=2e-3)
     np.testing.assert_allclose(blank[[1, 2, 7, 8]], full[1], atol=2e-3)
-    # with signal, but without a mask: excluded by hand or by a reader of files
+    # with signal but without a mask: excluded by the user or while reading the files
     one = stack()
     mask = one.mask.copy()
     mask[:, :, 4:6] = False
@@ -157,7 +157,7 @@ def test_slices_beyond_the_ends_cover_up_to_a_blank_one() -> None:
     cut = height_profile(slices_from_stacks([stack(masked=middle, dark=slice(7, 8))]))
     np.testing.assert_allclose(cut[6:9], [0.939 + NEIGHBOUR, NEIGHBOUR, 0], atol=3e-3)
     assert cut[:6].min() > 0.9
-    # a blank slice between them ends it on its side alone, whatever comes after
+    # a blank slice ends the coverage on its side, whatever comes after it
     other = height_profile(slices_from_stacks([stack(masked=middle, dark=slice(2, 3))]))
     np.testing.assert_allclose(other, cut[::-1], atol=1e-5)
 
@@ -178,7 +178,7 @@ def test_slices_beyond_the_ends_move_with_the_last_masked_one() -> None:
 @pytest.mark.parametrize("tilt", [0.0, 1e-13, 1e-3])
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
 def test_the_grid_s_axes_may_lie_in_or_across_the_slices(tilt: float, order: tuple[int, int, int]) -> None:
-    """The rows of the grid that are summed along run through a slice, or within one."""
+    """Sums run along rows of the grid, which pass through the slices or lie within one."""
     turn = Rotation.from_euler("x", tilt).as_matrix()
     slices = slices_from_stacks([stack((16, 14, 5), turn=turn)])
     affine = GRID.affine.copy()

@@ -1,4 +1,4 @@
-"""One acquisition in files of different programs: the same arrays, and the same geometry to the last bit."""
+"""One acquisition in files of different programs gives the same arrays and bit-identical geometry."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ORIENTATIONS = [np.array(signs) for signs in itertools.product((1, -1), repeat=2
 
 
 def oblique(seed: int, spacing_mm: tuple[float, float, float] = (1.171875, 1.171875, 3.3)) -> VolumeGrid:
-    """A grid as a scanner may have it, right- or left-handed."""
+    """An oblique grid as from a scanner, right- or left-handed."""
     rng = np.random.default_rng(seed)
     affine = np.eye(4)
     affine[:3, :3] = Rotation.random(random_state=seed).as_matrix() * spacing_mm * rng.choice([-1, 1], 3)
@@ -65,7 +65,7 @@ def test_rows_have_one_order_whoever_wrote_the_file(flips: NDArray[np.int64]) ->
 
 
 def test_the_geometry_is_the_same_to_the_last_bit() -> None:
-    """In all but a few of many acquisitions, whose numbers lie where rounding changes sides."""
+    """Except for a few of many acquisitions, whose values lie on the boundary of rounding."""
     n, differ = 300, 0
     for seed in range(n):
         grid = oblique(seed)

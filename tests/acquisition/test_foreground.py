@@ -1,4 +1,4 @@
-"""The mask of the result: the slices vote, each where it lies; what none has seen is decided by shape."""
+"""Foreground of the result: slices vote where they lie; the shape decides about unseen voxels."""
 
 from dataclasses import replace
 
@@ -50,17 +50,17 @@ def test_a_left_handed_header_ends_where_a_right_handed_one_does() -> None:
 
 
 def test_a_cut_off_end_is_unseen_and_not_background() -> None:
-    """The slices end inside of the head. What lies beyond is not known, and is as it is said to be by its shape."""
+    """The slices end inside the head, and the shape given by the network decides about the part beyond them."""
     found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)]), GRID)
     z = WORLD[..., 2]
-    # it ends three quarters of the slice distance beyond the centre of the last slice
+    # the mask ends three quarters of the slice spacing beyond the centre of the last slice
     assert found.unseen[z < -3.8].all()
     assert not found.unseen[(z > -2.2) & (np.abs(WORLD).max(-1) < 38)].any()
     assert found.brain[(z > 2) & (depth(WORLD) > 0.15)].all()
     assert not (found.brain & found.unseen).any()
-    # nobody says more: the mask ends with the slices
+    # without a network the mask ends with the slices
     assert not found.support()[z < -3.8].any()
-    # a network does: the whole head
+    # with a network it is the whole head
     likely = (depth(WORLD) > 0).astype(np.float32)
     mask = found.mask(likely)
     assert mask[depth(WORLD) > 0.1].all()
@@ -107,17 +107,17 @@ def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
     np.testing.assert_array_equal(found.mask(contrary), found.core | (found.unseen & right))
     shown = found.support(contrary)
     np.testing.assert_array_equal(shown & ~found.thin, (found.brain | (found.unseen & right)) & ~found.thin)
-    # where hardly a slice looked, the image may go on for two voxels
+    # where coverage is low, the shown image may extend for two voxels
     margin = shown & ~(found.brain | (found.unseen & right))
     assert margin.any()
     assert not (margin & ~binary_dilation(found.brain | (found.unseen & right), iterations=2)).any()
-    # what is hardly possible is not shown, what is undecided is not in the mask
+    # improbable voxels are not shown, and undecided ones are not in the mask
     np.testing.assert_array_equal(found.support(np.full(GRID.shape, 0.25)), found.support(0 * contrary))
     np.testing.assert_array_equal(found.mask(np.full(GRID.shape, 0.5)), found.mask(0 * contrary))
 
 
 def test_what_is_merely_possible_is_shown_beside_the_mask_alone() -> None:
-    """A slab at the border of the grid that touches the brain, as the network leaves it where it knows little."""
+    """Possible voxels form a slab at the border of the grid that touches the brain, as from an unsure network."""
     seen, possible = np.zeros((30, 9, 9), bool), np.zeros((30, 9, 9), bool)
     seen[2:9], possible[9:27] = True, True
     found = Foreground(seen, seen, seen.astype(np.float32), ~seen, np.zeros_like(seen), possible_voxels=4)
@@ -125,7 +125,7 @@ def test_what_is_merely_possible_is_shown_beside_the_mask_alone() -> None:
     shown = found.support(0.4 * possible)
     assert shown[2:13].all()
     assert not shown[13:].any()
-    # what is likely is in the mask, and shown as far as it reaches
+    # probable voxels are in the mask and shown in full
     assert found.support(0.6 * possible)[2:27].all()
 
 
@@ -149,7 +149,7 @@ def test_slices_without_weight_have_seen_nothing() -> None:
 
 
 def test_a_slice_without_weight_has_no_vote() -> None:
-    """A slice that lies wrongly would put brain beside the head and a hole into it."""
+    """A misplaced slice would put brain beside the head and a hole into it."""
     slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
     good = foreground_mask(slices)
     away = np.abs(slices.planes.center_mm @ TURNS[0][:, 2]) < 8
@@ -161,13 +161,13 @@ def test_a_slice_without_weight_has_no_vote() -> None:
     weight = np.where(away, 0.0, 1.0)
     trusting, careful = foreground_mask(astray), foreground_mask(astray, weight)
     assert (careful != good).sum() < 0.5 * (trusting != good).sum()
-    # where they lie or what they show makes no difference
+    # neither their poses nor their contents matter
     elsewhere = slices.with_pose(RigidPose(slices.planes.rotation, center + away[:, None] * 5.0))
     np.testing.assert_array_equal(foreground_mask(elsewhere, weight), careful)
 
 
 def test_what_one_stack_alone_has_seen_stays_inside() -> None:
-    """Partial coverage: two stacks that stop half-way have no say in what they did not cover."""
+    """Two stacks that cover half of the head do not vote about the other half."""
     whole = ellipsoid_stack(TURNS[0])
     partly = [ellipsoid_stack(t, low_mm=0.0) for t in TURNS[1:]]
     found = foreground(slices_from_stacks([whole, *partly]), GRID)
@@ -185,7 +185,7 @@ def test_what_most_stacks_call_outside_is_outside() -> None:
     wrong = replace(stacks[0], mask=spilt)
     many = [wrong, *stacks[1:], *stacks[1:]]
     mask = foreground_mask(slices_from_stacks(many))
-    # the others have looked at all of it, however far it is from their masks
+    # the other stacks cover all of it, however far it is from their masks
     assert mask[depth(WORLD) < -0.12].mean() < 0.02
 
 
@@ -214,7 +214,7 @@ def test_one_or_two_slices_are_enough(n_slices: int) -> None:
     few = slices.take(np.arange(middle, middle + n_slices))
     mask = foreground_mask(few)
     thickness_mm = volume_of(mask) / (np.pi * RADII_MM[0] * RADII_MM[1])
-    assert 0.8 * 3 * n_slices < thickness_mm < 3 * n_slices + 3  # beyond a lone slice nobody is asked
+    assert 0.8 * 3 * n_slices < thickness_mm < 3 * n_slices + 3  # beyond a lone slice the shape is not consulted
 
 
 def test_the_foreground_of_nothing_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""How much of the volume is shown about the mask of the result."""
+"""Edge of the volume around the foreground mask."""
 
 import numpy as np
 import pytest

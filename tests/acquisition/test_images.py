@@ -18,7 +18,7 @@ def test_int16_with_slope_and_intercept(tmp_path: Path) -> None:
     image = nib.Nifti1Image(raw, affine_of(AXES["LAS"]))
     image.header.set_slope_inter(0.25, -3.0)
     nib.save(image, tmp_path / "a.nii.gz")
-    # nibabel stores what was given after scaling; read the raw numbers to know what the file says
+    # nibabel scales values on writing, so the raw numbers are read
     stored = nib.Nifti1Image.from_filename(tmp_path / "a.nii.gz")
     assert stored.get_data_dtype() == np.int16
     assert isinstance(stored.dataobj, ArrayProxy)
@@ -78,7 +78,7 @@ def test_save_volume_into_a_missing_folder_is_refused(tmp_path: Path) -> None:
 
 
 def bad_files(folder: Path) -> dict[str, Path]:
-    """One file per way of being unusable."""
+    """One file per kind of unusable input."""
     image, _ = arrays()
     affine = affine_of(AXES["RAS"])
     files = {name: folder / f"{name}.nii.gz" for name in ("missing", "text", "frames", "complex", "colour", "singular")}

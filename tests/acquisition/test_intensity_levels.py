@@ -1,4 +1,4 @@
-"""Stacks on another intensity scale than the others'."""
+"""Intensity levels of stacks on different intensity scales."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_stack_on_another_scale_comes_to_that_of_the_others(factor: float) -> 
     assert level_notes(found) == [f"b: intensities times {1 / factor:.3g}, to match the other stacks"]
     gain = gain_in_files(np.ones(3), np.array([0, 1, 2]), found)
     np.testing.assert_allclose(gain, [1, factor, 1], rtol=1e-5)
-    assert same_level(found) == found  # once is enough
+    assert same_level(found) == found  # a second call changes nothing
 
 
 def test_levels_that_gains_make_up_for_are_left_alone() -> None:

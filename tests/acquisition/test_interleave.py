@@ -1,4 +1,4 @@
-"""The order in which slices are taken."""
+"""Acquisition order of slices."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_every_slice_is_taken_once(n_slices: int, interleave: int) -> None:
     assert sorted(order) == list(range(n_slices))
     steps = np.diff(order)
     assert (steps[: n_slices // interleave - 1] == interleave).all()
-    assert (steps < 0).sum() == interleave - 1  # so many times back to the beginning
+    assert (steps < 0).sum() == interleave - 1  # the number of returns to the beginning
 
 
 def test_an_interleave_below_one_is_refused() -> None:

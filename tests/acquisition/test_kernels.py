@@ -1,4 +1,4 @@
-"""The loops over pixels against scipy, in both precisions, for planes of more pixels than a run has."""
+"""Loops over pixels against scipy, in both precisions, for planes with more pixels than one run of the loop."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def large_planes() -> Planes:
 
 @pytest.mark.parametrize(("dtype", "bound"), [(np.float64, 1e-12), (np.float32, 1e-4)])
 def test_pixels_are_trilinear_readings_of_a_volume_in_zeros(dtype: type[np.floating], bound: float) -> None:
-    """Single precision knows where a pixel is to 1e-6 of a voxel, times differences of neighbours of up to ten."""
+    """Single precision resolves pixel positions to 1e-6 voxel, and neighbouring values differ by up to ten."""
     planes = large_planes()
     volume = np.random.default_rng(1).normal(size=GRID.shape)
     found = VoxelOperator(planes, GRID, None, (1, 1, 1)).forward(volume.astype(dtype))

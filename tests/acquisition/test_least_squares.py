@@ -1,4 +1,4 @@
-"""V_sharp: nearer to the head than V_coarse, and what its convention promises."""
+"""V_sharp: closer to the head than V_coarse, converging to the direct solution, and its convention."""
 
 import numba
 import numpy as np
@@ -60,7 +60,7 @@ def test_gain_and_weight_count(head: TruthVolume, slices: Slices) -> None:
 
 
 def small_problem() -> tuple[VoxelOperator, np.ndarray, np.ndarray]:
-    """Every third pixel of four oblique slices, and a 5 x 4 x 6 grid, pixels with noise and weights."""
+    """Every third pixel of four oblique slices with noise and weights, and a grid of 5 x 4 x 6 voxels."""
     rng = np.random.default_rng(2)
     grid = VolumeGrid.isotropic([-4, -3, -5], [4, 3, 5], 2.0)
     planes = Planes(
@@ -75,7 +75,7 @@ def small_problem() -> tuple[VoxelOperator, np.ndarray, np.ndarray]:
 
 
 def test_many_steps_find_the_direct_solution() -> None:
-    """Of the same normal equations, built column by column and solved in float64."""
+    """The direct solution solves the same normal equations, built column by column, in float64."""
     operator, value, weight = small_problem()
     n = int(np.prod(operator.grid.shape))
     unit = np.eye(n, dtype=np.float32).reshape(n, *operator.grid.shape)

@@ -1,4 +1,4 @@
-"""Masks that end inside the brain, told by what the image shows beside them."""
+"""Detection of masks that end inside the brain, by the image beside them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DISC = generate_binary_structure(2, 1)[:, :, None]
 
 
 def head(pixels: int = 0, surroundings: float = 0.0, sigma: float = 0.03, shell_mm: float = 70.0) -> Stack:
-    """A ball of radius 35 mm, a mask that is some pixels of 1 mm too large, and surroundings up to a radius."""
+    """A ball of radius 35 mm, a mask that is too large by some pixels of 1 mm, and surroundings up to a radius."""
     i, j, k = np.meshgrid(np.arange(160), np.arange(160), np.arange(12), indexing="ij", sparse=True)
     radius = np.sqrt((i - 80.0) ** 2 + (j - 80.0) ** 2 + (4 * (k - 5.5)) ** 2)
     brain = radius < 35
@@ -33,7 +33,7 @@ def test_a_mask_that_holds_the_brain_leaves_nothing_out(pixels: int) -> None:
 @pytest.mark.parametrize("sigma", [0.03, 0.14])
 @pytest.mark.parametrize("pixels", [-3, -4, -5])
 def test_a_mask_inside_the_brain_leaves_out_what_is_beside_it(pixels: int, sigma: float) -> None:
-    """At an SNR of 7 one pixel of noise in ten is as bright as dark brain, and must not hide what is left out."""
+    """At an SNR of 7, a tenth of the noise pixels is as bright as dark brain and must not hide the omitted part."""
     stack = head(pixels, sigma=sigma)
     used = stack.mask.any((0, 1))
     brain = head().mask[:, :, used]
@@ -50,7 +50,7 @@ def test_slices_without_a_mask_do_not_count() -> None:
 
 @pytest.mark.parametrize("shell_mm", [38.0, 45.0, 200.0])
 def test_surroundings_are_not_taken_for_brain(shell_mm: float) -> None:
-    """Skull and mother beside a mask that fits; only a thin layer alone cannot be told from brain."""
+    """Skull and mother lie beside a correct mask; only an isolated thin layer cannot be distinguished from brain."""
     share = left_out_share(head(surroundings=0.7, shell_mm=shell_mm))
     assert share == 0 or shell_mm < 41
 

@@ -1,4 +1,4 @@
-"""Planes and slices: taken, moved, refused; a volume as planes."""
+"""Planes and slices: selection, motion, refusals; a volume as planes."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Weights of slices: smooth, never zero, and most slices keep theirs."""
+"""Slice weights: smooth, never zero, and high for most slices."""
 
 import itertools
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def weights(loss: Array) -> Array:
-    """Of slices that are equally bright."""
+    """Weights of equally bright slices."""
     return slice_weights(loss, np.full(len(loss), 1.3), n_stacks=3)
 
 
@@ -33,7 +33,7 @@ def test_slice_weights_are_smooth_and_never_zero() -> None:
     assert np.median(weights(usual)) == 1.0
     assert (weights(np.zeros(5)) == 1).all()
     assert (weights(np.full(5, 3.3)) == 1).all()
-    for a, b in itertools.pairwise((1e-6, 1.0, 1e6)):  # a pure number of the loss
+    for a, b in itertools.pairwise((1e-6, 1.0, 1e6)):  # the unit of the loss does not matter
         np.testing.assert_allclose(weights(usual * a), weights(usual * b), rtol=1e-3)
 
 
@@ -48,14 +48,14 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float) -> N
     assert (weight < DROPPED_WEIGHT).sum() <= MAX_DROPPED_SHARE * n
     assert (weight < DROPPED_WEIGHT).sum() == min(len(bad), int(MAX_DROPPED_SHARE * n))
     assert weight.min() > 0
-    # those dropped are the worst, and all that are bad count less than all that are good
+    # the dropped slices are the worst, and every bad slice weighs less than every good one
     dropped = np.flatnonzero(weight < DROPPED_WEIGHT)
     assert loss[dropped].min() > np.median(loss) + 4
     assert weight[bad].max() < np.delete(weight, bad).min()
 
 
 def test_no_slice_of_a_single_stack_is_dropped_but_dark_ones() -> None:
-    """A volume that does not follow a slice fits it badly, and nothing else saw what it shows."""
+    """A volume that does not follow a slice fits it badly, and no other stack shows that part."""
     loss, gain = np.append(np.linspace(0.9, 1.1, 30), [20.0, 15.0, 0.0]), np.append(np.ones(32), 0.03)
     assert (slice_weights(loss, gain, 2)[[-3, -2, -1]] < 0.01).all()
     weight = slice_weights(loss, gain, 1)
@@ -65,7 +65,7 @@ def test_no_slice_of_a_single_stack_is_dropped_but_dark_ones() -> None:
 
 
 def test_a_slice_without_signal_counts_for_nothing() -> None:
-    """Explained by a gain near zero whatever the volume, it has the least residual of all."""
+    """A gain near zero explains it whatever the volume, so its residual is the smallest of all."""
     loss, gain = np.full(9, 1.0), np.full(9, 1.2)
     loss[4], gain[4] = 0.0, 0.03
     weight = slice_weights(loss, gain, 3)
@@ -76,7 +76,7 @@ def test_a_slice_without_signal_counts_for_nothing() -> None:
     assert min(falling) > 0
     assert (np.diff(falling) >= 0).all()
     assert slice_weights(np.ones(9), np.append(np.ones(8), DARK), 3)[-1] == 1.0
-    np.testing.assert_allclose(slice_weights(loss, 1e3 * gain, 3), weight)  # gains have no unit
+    np.testing.assert_allclose(slice_weights(loss, 1e3 * gain, 3), weight)  # the unit of gains does not matter
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 2.0, 3.0])

@@ -1,4 +1,4 @@
-"""JSON sidecars: what is read, what is left alone, and what is refused."""
+"""JSON sidecars: values that are read, values that are ignored, and refusals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DIRECTION_KEYS = ("PhaseEncodingDirection", "PhaseEncodingAxis", "InPlanePhaseEn
 
 
 def write(folder: Path, content: Any) -> Path:
-    """A sidecar of an object, or of text or bytes as they are."""
+    """Write a sidecar from an object, or from raw text or bytes."""
     path = folder / "a.json"
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -95,7 +95,7 @@ def test_no_file_and_nothing_in_it_are_no_error(tmp_path: Path) -> None:
 def test_the_phase_encoding_axis(
     tmp_path: Path, content: dict[str, str], axis: str | None, of_slices_first: str | None
 ) -> None:
-    """The word of DICOM counts only where the file's axes are still those of the scanner's images."""
+    """The DICOM value (ROW or COL) is used only if the file's axes are still those of the scanner's images."""
     found = read(tmp_path, content)
     assert found.phase_axis_of(2) == axis
     assert found.phase_axis_of(0) == of_slices_first
@@ -107,7 +107,7 @@ def test_the_phase_encoding_axis(
         b'\xef\xbb\xbf{"SliceThickness": 3}',  # byte order mark
         b'{"InstitutionName": "Universit\xe4t", "SliceThickness": 3}',  # Latin-1
         b'{"Comment": "two\nlines\tand a tab", "SliceThickness": 3}',
-        b'{"SliceThickness": 2, "SliceThickness": 3.0}',  # JSON allows it; the last one counts
+        b'{"SliceThickness": 2, "SliceThickness": 3.0}',  # JSON allows duplicate keys; the last one counts
         b'{"SliceThickness": 3, "EchoTime": NaN, "Other": "3", "SAR": -Infinity}',
     ],
 )
@@ -189,7 +189,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "c.json").symlink_to("c.json")
     with pytest.raises(InputError, match=r"c\.json: cannot be read"):
         read_sidecar(tmp_path / "c.json")
-    os.mkfifo(tmp_path / "d.json")  # would wait for ever if it were opened
+    os.mkfifo(tmp_path / "d.json")  # opening it would block for ever
     with pytest.raises(InputError, match=r"d\.json: is a pipe"):
         read_sidecar(tmp_path / "d.json")
 
@@ -199,13 +199,13 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path, monkeypatch: pyte
         raise PermissionError(13, "Permission denied")
 
     path = write(tmp_path, {})
-    monkeypatch.setattr(Path, "open", denied)  # permissions do not keep root out
+    monkeypatch.setattr(Path, "open", denied)  # root ignores file permissions
     with pytest.raises(InputError, match=r"a\.json: cannot be read \(Permission denied\); check"):
         read_sidecar(path)
 
 
 def read_or_refused(path: Path) -> Sidecar | None:
-    """What a file says, or None where it was refused in a good line."""
+    """The content of a sidecar, or None if it was refused with a proper message."""
     try:
         return read_sidecar(path)
     except InputError as error:

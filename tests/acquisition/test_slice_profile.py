@@ -1,4 +1,4 @@
-"""Who decides thickness and PSF of a stack: the option, the sidecar, or the header's spacing, with a warning."""
+"""Source of a stack's thickness and PSF: the option, the sidecar, or the header's spacing with a warning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, write
 
 SPACING_MM = (0.8, 0.9, 3.0)
-"""Of `affine_of`: pixels and slices."""
+"""Spacing of pixels and slices for `affine_of`."""
 
 P = 0.7
 WIDE = 1.2 / P
@@ -121,7 +121,7 @@ def test_a_run_that_is_repeated_does_not_ask_the_sidecar(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("p", [0.5, 0.7, 1.0])
 def test_the_width_is_that_of_the_lobe_of_a_k_space_filled_in_part(p: float) -> None:
-    """The nominal 1.2 pixels are the lobe's 1.207 rounded, so one percent is allowed."""
+    """The nominal width of 1.2 pixels is rounded from the lobe's 1.207, so one percent is allowed."""
     x = np.arange(-200_000, 200_001) * 1e-5  # pixels
     lobe = np.sinc(p * x) >= 0.5
     fwhm = np.ptp(x[lobe & (np.abs(p * x) < 1)])
@@ -168,7 +168,7 @@ def test_the_phase_encoding_axis_is_followed_through_the_axes_of_the_file(
     assert [f"phase encoding along {direction[0]}, which counts the slices" in line for line in caplog.messages] == (
         [True] * is_slice_axis
     )
-    # the wider axis in space, whatever the order in the file
+    # the wider axis is the same in space for every order of axes in the file
     (sigma,) = np.unique(np.sqrt(slices_from_stacks([stack]).planes.psf_var_mm2), axis=0)
     spacing = np.array([*stack.spacing_mm[:2], 2.5])
     np.testing.assert_allclose(sigma * FWHM_PER_SIGMA, np.array([*expected, 1.0]) * spacing)
@@ -247,7 +247,7 @@ def test_real_stacks_without_their_sidecars(real: list[Path], tmp_path: Path, ca
 
 
 def test_real_images_hold_nothing_beyond_the_phase_resolution(real: list[Path]) -> None:
-    """Along the axis that the sidecar names, and there alone, the spectrum ends at 0.7 of the highest frequency."""
+    """Only along the axis that the sidecar names does the spectrum end at 0.7 of the highest frequency."""
     for path, phase in zip(real, (0, 1, 0), strict=True):
         data = np.asarray(nib.Nifti1Image.from_filename(path).dataobj, dtype=np.float64)
         power = []

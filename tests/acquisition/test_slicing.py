@@ -1,4 +1,4 @@
-"""From stacks to slices: what is cut, normalised and measured by the headers."""
+"""Conversion of stacks to slices: cropping, normalisation, and geometry by the headers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ def test_the_masked_volume_is_the_heads() -> None:
     slices, _ = as_slices(simulated(head))
     true_mm3 = head.mask.sum() * abs(np.linalg.det(head.affine))
     assert head_volume_mm3(slices) == pytest.approx(true_mm3, rel=0.05)
-    # whichever slices are there
+    # for any choice of slices
     assert head_volume_mm3(slices.take(slices.stack_id == 1)) == pytest.approx(true_mm3, rel=0.07)
     other = slices.take(slices.slice_index % 2 == 0)
     assert head_volume_mm3(other) == pytest.approx(true_mm3, rel=0.07)
@@ -40,7 +40,7 @@ def test_normalised_slices_have_their_99th_percentile_at_one() -> None:
 def assert_pixels_are_voxels(stack: Stack, image: np.ndarray, affine: np.ndarray, n_masked: int) -> None:
     """Every masked pixel of the slices: position and value are those of the voxel it was cut from."""
     slices = by_headers(slices_from_stacks([stack]), [stack])
-    np.testing.assert_allclose(slices.world_from_header().translation_mm, 0, atol=0.02)  # as they are read
+    np.testing.assert_allclose(slices.world_from_header().translation_mm, 0, atol=0.02)  # header tolerance
     slices = slices.with_pose(slices.header_pose)
     world = slices.planes.pixel_world_mm(slices.pixel_index)
     assert len(world) == n_masked

@@ -1,4 +1,4 @@
-"""The smooth continuation keeps what was measured, and makes nothing up beyond means of it."""
+"""The smooth continuation keeps measured values, and fills only with means of them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_half_a_weight_is_half_a_voice() -> None:
     values = np.zeros(SHAPE, np.float32)
     values[15, 13, 20] = 8
     filled = smooth_fill(values, known)
-    # its own surroundings have a little of it
+    # neighbouring voxels contain a little of it
     assert 4 < filled[15, 13, 20] < 4.3
     assert np.delete(filled.ravel(), np.ravel_multi_index((15, 13, 20), SHAPE)).max() == 0
 

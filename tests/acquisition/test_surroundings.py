@@ -1,4 +1,4 @@
-"""The rim of the brain: what lies beside it is taken out of its pixels, whatever it is."""
+"""The rim of the brain: the share of the surroundings is removed from its pixels, whatever they are."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def corrected(slices: Slices, gain: np.ndarray | None = None) -> tuple[Slices, n
 def test_an_even_brain_is_even_up_to_its_rim_whatever_lies_beside_it(outside: float) -> None:
     slices = stacks_of(np.where(BRAIN, 1.0, outside))
     found, share = corrected(slices)
-    # pixels that are mostly brain; the rest are blown-up differences
+    # pixels that are mostly brain; in the others, differences are amplified
     good = slices.mask & (share > 0.6)
     before, after = (np.abs(one.value[good] - 1) for one in (slices, found))
-    # where a mask touches its box, no pixel says what is outside, and nothing changes
+    # where a mask touches its box, no pixel shows the surroundings, and nothing changes
     assert after.mean() < 0.35 * before.mean() + 1e-3
     assert np.quantile(after, 0.95) < 0.4 * np.quantile(before, 0.95) + 1e-3
     assert after.max() < before.max() + 1e-3
@@ -60,7 +60,7 @@ def test_an_even_brain_is_even_up_to_its_rim_whatever_lies_beside_it(outside: fl
 def test_the_share_is_that_of_the_profile_and_bounded() -> None:
     slices = stacks_of(BRAIN.astype(float))
     _, share = corrected(slices)
-    # beside black, and with an intensity of one, a pixel is its share of brain
+    # next to black, and with a brain intensity of one, a pixel's value is its share of brain
     exact = slices.value.clip(LEAST_SHARE, 1)
     assert np.abs(share - exact)[slices.mask].mean() < 0.01
     assert share.min() >= LEAST_SHARE

@@ -1,4 +1,4 @@
-"""A template fitted to the seen part of a head tells more of the unseen part than one that is only placed there."""
+"""A template fitted to the seen part of a head predicts the unseen part better than a template that is only placed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def brain(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def head_in_template(place: np.ndarray) -> np.ndarray:
-    """Where a point of the head lies in the template: an affine map, then a wave."""
+    """Position of a point of the head in the template: an affine map, then a wave."""
     moved = (place - SHIFT_MM) @ TURN @ np.linalg.inv(SIZE)
     return moved + WAVE_MM * np.sin(moved[..., [1, 2, 0]] / 14)
 
@@ -50,7 +50,7 @@ HEAD = (1.3 * TRUTH - 0.35 * TRUTH**2).astype(np.float32)  # another contrast
 
 
 def case(hidden: np.ndarray) -> dict[str, Any]:
-    """What slices saw of the head: all but the hidden part, into which the coverage fades, and noise."""
+    """The seen head with noise; the coverage fades into the hidden part."""
     seen = gaussian_filter((~hidden).astype(np.float32), 0.75)
     known = seen > 1e-3
     noise = 0.05 * np.random.default_rng(0).standard_normal(GRID.shape).astype(np.float32)
@@ -64,7 +64,7 @@ SLABS = {
 
 
 def coloured(values: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """The best that t and t^2 make of a template in some voxels: more than any fit could know."""
+    """The best combination of t and t^2 in the given voxels, an upper bound for any fit."""
     terms = np.stack([values[part], values[part] ** 2], -1)
     return terms @ np.linalg.lstsq(terms, HEAD[part], rcond=None)[0]
 
@@ -85,7 +85,7 @@ def fitted(hidden: np.ndarray) -> TemplateFit:
 
 def test_the_hidden_part_is_found(hidden: np.ndarray, fitted: TemplateFit) -> None:
     part = hidden & INSIDE
-    placed = brain(world(GRID))[0]  # the template where it was
+    placed = brain(world(GRID))[0]  # the template in its initial place
     before = float(np.sqrt(((coloured(placed, part) - HEAD[part]) ** 2).mean()))
     after = float(np.sqrt(((fitted.values[part] - HEAD[part]) ** 2).mean()))
     assert after < 0.65 * before
@@ -149,5 +149,5 @@ def test_nothing_seen_is_no_failure() -> None:
     given = case(np.ones(GRID.shape, bool))
     found = fit_template(TEMPLATE, TEMPLATE_GRID, **given, n_steps=QUICK)
     assert np.isfinite(found.values).all()
-    # the outline is that of the template, in its place
+    # the outline is that of the placed template
     assert dice(found.inside > 0.5, brain(world(GRID))[1]) > 0.96

@@ -1,4 +1,4 @@
-"""Total variation: its operator is the gradient of what it says, and it leaves edges."""
+"""Total variation: its operator is the gradient of its value, and it preserves edges."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_constant_has_none(volume: np.ndarray) -> None:
 
 
 def test_with_its_own_weights_it_is_half_the_length_of_the_gradient(volume: np.ndarray) -> None:
-    """x^T D^T W D x with W = 1 / (2 |Dx|) is |Dx| / 2, where the tip does not count."""
+    """x^T D^T W D x with W = 1 / (2 |Dx|) is |Dx| / 2 wherever the rounded tip is negligible."""
     length = np.sqrt(sum(np.diff(volume, axis=a, append=np.take(volume, [-1], a)) ** 2 for a in range(3)))
     energy = float((volume * divergence_of_gradient(volume, diffusivity(volume, 1e-6))).sum())
     assert energy == pytest.approx(0.5 * float(length.sum()), rel=1e-3)

@@ -1,4 +1,4 @@
-"""The voxel operator: exact adjoint, exact on ramps, right on a Gaussian; the PSF's quadrature."""
+"""The voxel operator: exact adjoint, exact on ramps, correct on a Gaussian; quadrature of the PSF."""
 
 import numba
 import numpy as np
@@ -94,7 +94,7 @@ def test_a_gaussian_through_the_psf_has_its_closed_form() -> None:
         variance = sigma**2 + planes.psf_var_mm2[k]
         local = (planes.take([k]).pixel_world_mm() - mean) @ planes.rotation[k]
         expected.append(np.sqrt(sigma**6 / variance.prod()) * np.exp(-0.5 * (local**2 / variance).sum(1)))
-    # trilinear reading adds h^2/6 of variance on average: 3 h^2 / (12 sigma^2) = 0.4 % of the peak
+    # trilinear interpolation adds h^2/6 of variance on average: 3 h^2 / (12 sigma^2) = 0.4 % of the peak
     assert np.abs(pixels - np.concatenate(expected)).max() < 0.005
 
 
@@ -148,7 +148,7 @@ def test_psf_nodes_have_the_moments_of_a_gaussian(n: int) -> None:
     assert (weights * nodes).sum() == pytest.approx(0, abs=1e-15)
     assert (weights * nodes**2).sum() == pytest.approx(0 if n == 1 else 1, abs=1e-14)
     np.testing.assert_allclose(nodes, -nodes[::-1])
-    if n >= 7:  # kurtosis of a Gaussian cut at 2.6 sigma: 2.6, of the whole 3
+    if n >= 7:  # the kurtosis of a Gaussian is 3, and 2.6 if it is cut at 2.6 sigma
         assert 2.2 < (weights * nodes**4).sum() < 3.1
 
 

@@ -1,4 +1,4 @@
-"""`g3r-bench kernels` measures what it says, and says it whole."""
+"""`g3r-bench kernels`: its record, its table, and what it keeps when interrupted."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""The Pareto front, and exponents of made-up data."""
+"""The Pareto front, and exponents of synthetic data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records: the machine, JSON written whole, tables between markers."""
+"""Records: the machine, JSON written atomically, tables between markers."""
 
 from __future__ import annotations
 

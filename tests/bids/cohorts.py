@@ -1,4 +1,4 @@
-"""What a cohort has made: volumes and rows of its table."""
+"""Results of a cohort: volumes and rows of its table."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ def rows(out: Path) -> dict[str, dict[str, str]]:
 
 
 def volumes(out: Path) -> dict[str, int]:
-    """When each volume was written (ns), by name."""
+    """Time of writing of each volume (ns), by name."""
     return {path.name: path.stat().st_mtime_ns for path in out.glob("sub-*/**/*_rec-g3r_T2w.nii.gz")}

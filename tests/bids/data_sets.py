@@ -12,17 +12,17 @@ import nibabel as nib
 import numpy as np
 
 MASK_ENDS = {"desc": "_desc-brain_mask.nii.gz", "mialsrtk": "_T2w_desc-brain_mask.nii.gz", "plain": "_mask.nii.gz"}
-"""Of mask files, after the entities of their stack: the three patterns that are in use."""
+"""Endings of mask file names after the entities of their stack: the three common patterns."""
 
 BROKEN = b"broken"
 """Content of a stack that the stand-in refuses."""
 
 ENDLESS, HUNGRY = b"endless", b"hungry"
-"""Content of stacks that the stand-in never ends with, and for which it takes 600 MB of memory."""
+"""Content of stacks on which the stand-in hangs, and for which it takes 600 MB of memory."""
 
 
 def begin(participant: str, session: str | None) -> str:
-    """How the files of a session begin."""
+    """Common prefix of the file names of a session."""
     return f"sub-{participant}" + (f"_ses-{session}" if session else "")
 
 
@@ -41,8 +41,8 @@ def add_session(
         participant: label.
         session: label, or None.
         stacks: entities between session and suffix (run-1), the image and its mask; each a file or bytes.
-        pattern: of the masks' names, see `MASK_ENDS`.
-        derivative: in which the masks are.
+        pattern: of mask names, see `MASK_ENDS`.
+        derivative: name of the derivative that holds the masks.
     """
     stem = begin(participant, session)
     inside = Path(*stem.split("_")) / "anat"
@@ -66,7 +66,7 @@ def _put(content: bytes | Path, path: Path) -> None:
 
 
 def ready_result(folder: Path) -> Path:
-    """A folder as g3r-infer writes it, small."""
+    """A small output folder as written by g3r-infer."""
     folder.mkdir(parents=True)
     for name in ("volume", "mask", "uncertainty", "prior_share", "density", "unseen"):
         nib.save(nib.Nifti1Image(np.ones((3, 4, 5), np.float32), np.eye(4)), folder / f"{name}.nii.gz")
@@ -87,12 +87,12 @@ def ready_result(folder: Path) -> Path:
 
 
 def stand_in(result: Path, events: Path, seconds: float = 0.0) -> tuple[str, ...]:
-    """A command in place of g3r-infer.
+    """A command that stands in for g3r-infer.
 
     Args:
-        result: that it copies.
-        events: folder for a file for each start and end.
-        seconds: that it takes.
+        result: folder that it copies.
+        events: folder in which it writes a file at each start and end.
+        seconds: duration of a run.
     """
     events.mkdir(exist_ok=True)
     return (sys.executable, str(Path(__file__).with_name("stand_in.py")), str(result), str(events), str(seconds))

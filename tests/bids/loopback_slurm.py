@@ -1,4 +1,4 @@
-"""A Slurm of one node on this machine, of Debian's packages slurm-wlm and munge, that listens on loopback alone."""
+"""A Slurm of one node on this machine that listens only on loopback (Debian packages slurm-wlm and munge)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ PartitionName=quick Nodes=localhost Default=YES MaxTime=60 State=UP
 
 
 def missing() -> str | None:
-    """Why there can be no Slurm here; None where there can."""
+    """The reason why Slurm cannot run here; None if it can."""
     absent = [name for name in PROGRAMS if shutil.which(name) is None]
     if absent:
         return f"{', '.join(absent)} not found; apt-get install slurm-wlm munge"
@@ -55,11 +55,11 @@ def missing() -> str | None:
 
 @contextlib.contextmanager
 def loopback_slurm(folder: Path, cores: int = 2, memory_mb: int = 4000) -> Iterator[None]:
-    """Slurm as long as it is entered; SLURM_CONF leads its commands there.
+    """Context in which Slurm runs; SLURM_CONF directs its commands to it.
 
     Args:
-        folder: for its state and logs; others than root may enter it.
-        cores: of its node, whether there are so many or not.
+        folder: for its state and logs; users other than root may enter it.
+        cores: stated cores of its node, which need not exist.
         memory_mb: of its node.
     """
     folder.mkdir(parents=True, mode=0o755)

@@ -1,4 +1,4 @@
-"""In place of g3r-infer: copies a ready result, after some time, and notes when it ran."""
+"""Stand-in for g3r-infer: copies a prepared result after some time and records when it ran."""
 
 import json
 import shutil
@@ -19,10 +19,10 @@ if stack.read_bytes().startswith(b"endless"):
     seconds = 600
 if stack.read_bytes().startswith(b"hungry"):
     held = bytearray(600_000_000)
-    held[::4096] = b"x" * len(held[::4096])  # pages that are not written are not taken
+    held[::4096] = b"x" * len(held[::4096])  # the system allocates only pages that are written
     seconds = 600
 time.sleep(seconds)
-staging = output.with_name("unfinished")  # as g3r-infer does, it is there whole or not at all
+staging = output.with_name("unfinished")  # appears atomically, as with g3r-infer
 shutil.copytree(result, staging, dirs_exist_ok=True)
 shutil.rmtree(output, ignore_errors=True)
 staging.rename(output)

@@ -1,4 +1,4 @@
-"""Many sessions with a stand-in for g3r-infer: what is made, what is not made again, what fails."""
+"""Many sessions with a stand-in for g3r-infer: results, repeated runs, failures."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def raw(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
-    """Puts the stand-in in place of g3r-infer."""
+    """Use the stand-in instead of g3r-infer."""
     result = ready_result(tmp_path / "ready")
 
     def put(seconds: float = 0.0) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ def test_never_more_processes_than_jobs(raw: Path, use: Use, tmp_path: Path) -> 
 
 
 def has_ended(process: psutil.Process, within_s: float = 10.0) -> bool:
-    """Whether a process ends in time; it may wait for its parent to take notice."""
+    """Whether a process ends in time; a zombie counts as ended."""
     until = time.monotonic() + within_s
     while time.monotonic() < until:
         with contextlib.suppress(psutil.NoSuchProcess):
@@ -124,7 +124,7 @@ def has_ended(process: psutil.Process, within_s: float = 10.0) -> bool:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_run_that_was_cut_short_goes_on(raw: Path, use: Use, tmp_path: Path, number: signal.Signals) -> None:
-    """Its children end with it; what it had made is not made again."""
+    """Its child processes end with it, and finished sessions are not repeated."""
     command, out = use(1.0), tmp_path / "out"
     line = [str(raw), str(out), "participant", "--jobs", "2"]
     code = f"import sys; from g3r.bids import cohort; cohort.INFER = {command!r}\n"
@@ -137,7 +137,7 @@ def test_a_run_that_was_cut_short_goes_on(raw: Path, use: Use, tmp_path: Path, n
         children = psutil.Process(run.pid).children()
         assert 1 <= len(children) <= 2
         run.send_signal(number)
-        if number == signal.SIGKILL:  # nobody is left to end them
+        if number == signal.SIGKILL:  # no process is left to end the children
             for child in children:
                 child.kill()
         _, said = run.communicate(timeout=60)

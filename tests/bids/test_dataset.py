@@ -81,7 +81,7 @@ def test_masks_that_g3r_found_are_not_the_users(tmp_path: Path, makers: list[dic
         assert None not in find_masks(session, tmp_path, tmp_path / "out")
     description.write_text(json.dumps({"GeneratedBy": makers}))
     assert find_masks(session, tmp_path, tmp_path / "out") == [None, None]
-    # somebody may have corrected them there, and says so
+    # the user may have corrected them there, and names the derivative
     assert None not in find_masks(session, tmp_path, tmp_path / "out", "g3r-before")
     add_session(tmp_path, "01", None, STACKS, derivative="mine")
     assert all(mask and "mine" in mask.parts for mask in find_masks(session, tmp_path, tmp_path / "out"))
@@ -95,7 +95,7 @@ def test_two_derivatives_with_masks_are_not_chosen_from(tmp_path: Path) -> None:
         find_masks(session, tmp_path, tmp_path / "out")
     chosen = find_masks(session, tmp_path, tmp_path / "out", "right")
     assert all(mask and "right" in mask.parts for mask in chosen)
-    # what this command wrote before is no second derivative
+    # an earlier output of this command does not count as a second derivative
     assert find_masks(session, tmp_path, tmp_path / "derivatives" / "left") == chosen
     for name in ("middle", ".", "..", "left/sub-01", str(tmp_path)):
         with pytest.raises(InputError, match="is no folder; pass --mask-derivative a name"):

@@ -1,4 +1,4 @@
-"""`g3r-bids` with g3r-infer itself: what it writes, as pybids and the BIDS validator see it."""
+"""`g3r-bids` with the real g3r-infer: its derivative data set, as read by pybids and the BIDS validator."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def far_away(path: Path, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def written(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A derivative inside the data set: three stacks, one stack, one that is cut off, and two far from each other."""
+    """A derivative inside the data set: sessions of three stacks, one stack, a truncated stack, two distant stacks."""
     raw = tmp_path_factory.mktemp("bids") / "data"
     add_session(raw, "01", "a", stacks(subject, 3), "plain")
     add_session(raw, "02", None, stacks(subject, 1), "mialsrtk")
@@ -92,7 +92,7 @@ def test_a_session_is_there_whole_or_not_at_all(written: Path) -> None:
 def test_pybids_finds_one_volume_for_each_session(written: Path) -> None:
     bids = pytest.importorskip("bids", reason="pybids is not installed")
     layout = bids.BIDSLayout(written, validate=False, is_derivative=True)
-    assert sorted(layout.get_subjects()) == ["01", "02"]  # one that failed is not in the data set
+    assert sorted(layout.get_subjects()) == ["01", "02"]  # a failed session is not in the data set
     volumes = layout.get(reconstruction="g3r", suffix="T2w", extension=".nii.gz", desc=None)
     assert [one.filename for one in volumes] == ["sub-01_ses-a_rec-g3r_T2w.nii.gz", "sub-02_rec-g3r_T2w.nii.gz"]
     masks = layout.get(reconstruction="g3r", suffix="mask", desc="brain", extension=".nii.gz")
@@ -120,7 +120,7 @@ def test_the_form_code_and_the_transform_belong_together(written: Path) -> None:
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_itk_puts_a_stack_where_the_volume_shows_it(subject: Path, written: Path, number: int) -> None:
-    """By its own transform best, by that of all stacks less well, and not by the headers alone."""
+    """Its own transform fits best, that of all stacks less well, and the headers alone do not fit."""
     import SimpleITK
 
     anat = written / "sub-01" / "ses-a" / "anat"
@@ -144,7 +144,7 @@ def test_itk_puts_a_stack_where_the_volume_shows_it(subject: Path, written: Path
     read = [SimpleITK.ReadTransform(str(next(anat.glob(f"*_{x}_{XFM}")))) for x in (f"run-{number + 1}", "rec-g3r")]
     (own, own_dice), (mean, mean_dice), (none, _) = map(scores, (*read, SimpleITK.Transform()))
     assert own > mean > none
-    # one rigid motion for a stack whose slices moved, and 4 mm thick: it cannot be near 1
+    # one rigid motion for a stack of moving slices of 4 mm: the correlation cannot be near 1
     assert own > 0.45
     assert own_dice > 0.95
     assert mean_dice > 0.88
@@ -158,7 +158,7 @@ def test_no_folder_of_this_machine_is_named(written: Path) -> None:
 
 
 def test_the_bids_validator_accepts_it(written: Path) -> None:
-    """`pip install bids-validator-deno` brings it; it asks the network for nothing."""
+    """The validator comes from `pip install bids-validator-deno` and makes no network requests."""
     validator = shutil.which("bids-validator-deno")
     if validator is None:
         pytest.skip("bids-validator-deno is not installed")

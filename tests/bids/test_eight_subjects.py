@@ -1,4 +1,4 @@
-"""Eight subjects through g3r-infer itself, one with a file that was cut off and one without overlap."""
+"""Eight subjects with the real g3r-infer, one with a truncated file and one without overlap."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAR_MM = 300.0
 
 
 def moved(path: Path, folder: Path, along_x_mm: float) -> Path:
-    """A copy of an image whose header puts it elsewhere."""
+    """A copy of an image with a shifted header."""
     image = nib.Nifti1Image.from_filename(path)
     affine = image.affine.copy()
     affine[0, 3] += along_x_mm

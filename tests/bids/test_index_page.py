@@ -1,4 +1,4 @@
-"""The page of a cohort: the worst first, and nothing in it that could be run or fetched."""
+"""The page of a cohort: worst sessions first, no executable content, no external requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a result's folder to a derivative, without a reconstruction: masks that were found, and what is kept."""
+"""Derivative from an output folder, without a reconstruction: found masks, replaced and interrupted results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def session(tmp_path: Path) -> Session:
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
-    """Of two stacks, the second with a mask that was found."""
+    """Output folder of two stacks, the second with a found mask."""
     folder = ready_result(tmp_path / "result")
     nib.save(nib.Nifti1Image(np.ones((2, 2, 2), np.uint8), np.eye(4)), folder / "brain-mask-1.nii.gz")
     (folder / "masks.png").write_bytes(b"picture")
@@ -38,7 +38,7 @@ def result(tmp_path: Path) -> Path:
 
 
 def make(session: Session, result: Path, tmp_path: Path) -> Path:
-    """The anat folder of the derivative."""
+    """Make the derivative and return its anat folder."""
     raw, out = tmp_path / "raw", tmp_path / "out"
     make_derivative(session, result, session.stacks, raw, out, out / ".g3r" / "sub-01" / "derivative")
     assert not list((out / ".g3r").rglob("*.*"))

@@ -1,4 +1,4 @@
-"""File names taken apart."""
+"""Parsing of BIDS file names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bounded number of processes, and their end."""
+"""The local pool: bounded number of processes, and how they end."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from g3r.bids.pool import LocalPool
 
 
 def sleeper(folder: Path, seconds: float, before: str = "pass") -> Job:
-    """A job that notes its process in its log."""
+    """A job that writes its process id into its log."""
     code = f"import os, signal, time; {before}; print(os.getpid(), flush=True); time.sleep({seconds})"
     return Job(words=(sys.executable, "-c", code), log=folder / f"{time.monotonic_ns()}.log")
 
 
 def process_of(job: Job) -> psutil.Process | None:
-    """The process of a job, as soon as it has said who it is; None where it has gone."""
+    """The process of a job, once it has written its id; None if it has ended."""
     until_s = time.monotonic() + 20
     while time.monotonic() < until_s:
         lines = job.log.read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Sidecars of folders above, and the thickness that g3r-infer takes from them."""
+"""Inherited sidecars from parent folders, and the thickness that g3r-infer takes from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_nearer_files_win_and_others_do_not_count(raw: Path) -> None:
     axial, coronal = find_sessions(raw)[0].stacks
     assert inherited(axial, raw) is None
     write(axial.with_name("sub-01_ses-1_acq-ax_run-1_T2w.json"), PhaseResolution=0.7)
-    assert inherited(axial, raw) is None  # g3r-infer reads that one itself
+    assert inherited(axial, raw) is None  # g3r-infer reads the sidecar beside the image itself
     write(raw / "T2w.json", SliceThickness=4, PhaseResolution=0.5, SpacingBetweenSlices=5, PatientName="x")
     write(raw / "acq-ax_T2w.json", SliceThickness=3.5)
     write(raw / "acq-sag_T2w.json", SliceThickness=9)
@@ -44,7 +44,7 @@ def test_the_link_has_all_keys_beside_it(raw: Path, tmp_path: Path) -> None:
     write(raw / "T2w.json", SliceThickness=3.25)
     keys = inherited(stack, raw)
     assert keys
-    for _ in range(2):  # a second run finds the first one's link
+    for _ in range(2):  # a second run finds the link of the first run
         link = with_sidecar(stack, keys, tmp_path / "stacks")
     assert link.name == stack.name
     assert link.read_bytes() == b"x"

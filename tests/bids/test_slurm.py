@@ -1,4 +1,4 @@
-"""Sessions through submitit's debug executor, which runs them here, and what is said where Slurm is not."""
+"""Sessions through submitit's debug executor, which runs them here, and messages without Slurm."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_sessions_in_an_array(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same rows as from the pool of this machine; what is done is not submitted again."""
+    """The rows equal those of the local pool, and finished sessions are not submitted again."""
     slurm = pytest.importorskip("g3r.bids.slurm", reason="the slurm extra is not installed")
     monkeypatch.setattr(slurm, "SlurmArrays", functools.partial(slurm.SlurmArrays, cluster="debug"))
     monkeypatch.setattr(slurm, "LONGEST_ARRAY", 2)
@@ -52,7 +52,7 @@ def test_a_process_that_cannot_be_started(raw: Path, tmp_path: Path, monkeypatch
 
 
 def test_what_sbatch_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stated memory and cores, the limit of time, the parallelism; words of the user come last."""
+    """Stated memory and cores, time limit and parallelism, followed by the user's options."""
     slurm = pytest.importorskip("g3r.bids.slurm", reason="the slurm extra is not installed")
     from submitit.slurm.slurm import _make_sbatch_string
 

@@ -56,7 +56,7 @@ def events(tmp_path: Path) -> list[dict[str, Any]]:
 
 
 def is_empty_soon() -> bool:
-    """Whether no job is left in the queue; those that have written their result take a moment to go."""
+    """Whether the queue becomes empty; jobs that have written their result need a moment to leave it."""
     until_s = time.monotonic() + 15
     while time.monotonic() < until_s:
         if not subprocess.run(["squeue", "--noheader"], capture_output=True, text=True, check=True).stdout:
@@ -66,7 +66,7 @@ def is_empty_soon() -> bool:
 
 
 def test_an_array_of_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Never more tasks than --jobs; one bad session stops nobody; what is done is not submitted again."""
+    """At most --jobs tasks run, one bad session stops no other, and finished sessions are not submitted again."""
     raw = data_set(tmp_path / "raw", {f"0{n}": BROKEN if n == 4 else b"image" for n in range(1, 7)})
     out = tmp_path / "out"
     use(tmp_path, monkeypatch, 1.0)
@@ -102,7 +102,7 @@ def test_tasks_that_slurm_ends(
 
 
 def test_slurms_signal_comes_before_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process is asked to stop while there is time, and its log is whole."""
+    """The process gets the stop request before the limit, and its log is complete."""
     monkeypatch.setattr("g3r.bids.slurm.SIGNAL_BEFORE_S", 90)
     raw = data_set(tmp_path / "raw", {"01": ENDLESS})
     use(tmp_path, monkeypatch)
@@ -148,7 +148,7 @@ def test_a_run_that_was_cut_short_goes_on(
     assert "Traceback" not in said
     made = volumes(out)
     assert len(made) == 2
-    if number == signal.SIGKILL:  # nobody is left to cancel what waits
+    if number == signal.SIGKILL:  # no process is left to cancel waiting tasks
         assert main(line) == 3
         said = capsys.readouterr().err
         assert "of an earlier run waits or runs" in said

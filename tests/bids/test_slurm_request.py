@@ -1,4 +1,4 @@
-"""The words after --slurm."""
+"""Parsing of the words after --slurm."""
 
 from __future__ import annotations
 

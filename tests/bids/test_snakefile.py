@@ -33,13 +33,13 @@ def raw(tmp_path: Path) -> Path:
     for label in ("01", "02", "03"):
         content = BROKEN if label == "02" else b"image"
         add_session(tmp_path / "raw", label, "a" if label == "03" else None, [("run-1", content, b"mask")])
-    (tmp_path / "raw" / "sub-04" / "func").mkdir(parents=True)  # not for g3r
+    (tmp_path / "raw" / "sub-04" / "func").mkdir(parents=True)  # no anatomical images, so not for g3r
     return tmp_path / "raw"
 
 
 @pytest.fixture
 def g3r(tmp_path: Path) -> Path:
-    """A command like g3r-bids."""
+    """A command in place of g3r-bids that uses the stand-in."""
     command = stand_in(ready_result(tmp_path / "ready"), tmp_path / "events")
     path = tmp_path / "g3r-bids"
     path.write_text(
@@ -65,7 +65,7 @@ def test_it_states_what_g3r_bids_reckons_with() -> None:
 
 
 def test_participants_without_a_stack_are_not_listed(tmp_path: Path) -> None:
-    """g3r-bids refuses them, and one refusal would leave the workflow unfinished."""
+    """g3r-bids refuses such participants, and one refusal would leave the workflow unfinished."""
     for label, session, name in (
         ("04", None, "run-1"), ("01", "a", ""), ("02", "b", "acq-x_run-1"), ("05", None, "rec-a"), ("06", "a", "echo-1")
     ):  # fmt: skip

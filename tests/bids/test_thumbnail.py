@@ -20,7 +20,7 @@ def drawn(data: np.ndarray, affine: np.ndarray, folder: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("flipped", [False, True])
 def test_sections_are_turned_as_on_the_large_picture(flipped: bool, tmp_path: Path) -> None:
-    """A bright corner at the right, at the front and at the top, in whatever order voxels are stored."""
+    """A corner that is bright at the right, front and top, for any storage order of voxels."""
     data = np.full((10, 12, 8), 0.5)
     data[7:, 9:, :] = 1.0
     affine = np.eye(4)

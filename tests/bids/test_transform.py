@@ -1,4 +1,4 @@
-"""ITK's text file of the way from the scanner, read by ITK."""
+"""The ITK transform file from the scanner to the volume's space, read by ITK."""
 
 from __future__ import annotations
 

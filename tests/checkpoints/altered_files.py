@@ -1,4 +1,4 @@
-"""Small exported networks, and files of them with another description, other tensors or other bytes."""
+"""Small exported networks, and files with altered descriptions, tensors or bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.model import Prior
 
 Content = dict[str, Any]
-"""What a file holds: its description, with the tensors by name under "weights"."""
+"""Content of a file: its description, with the tensors by name under "weights"."""
 
 
 def small_prior() -> Prior:
@@ -36,7 +36,7 @@ def small_prior() -> Prior:
 
 
 def small_pose() -> PoseModel:
-    """A pose network that is as small as it can be."""
+    """The smallest possible pose network."""
     torch.manual_seed(0)
     config = PoseNetworkConfig(
         template_shape=(2, 5, 6, 4),
@@ -60,14 +60,14 @@ def content_of(path: Path) -> Content:
 
 
 def write_content(path: Path, content: Content) -> None:
-    """Write what `content_of` gave, changed; nothing is checked."""
+    """Write a changed result of `content_of` without any check."""
     weights: dict[str, Tensor] = content["weights"]
     description = {name: value for name, value in content.items() if name != "weights"}
     path.write_bytes(save(weights, {DESCRIPTION_KEY: json.dumps(description)}))
 
 
 def change_header(whole: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
-    """The bytes of a file with another header in front of the same tensors."""
+    """The bytes of a file with a changed header before the same tensors."""
     n_header = int.from_bytes(whole[:8], "little")
     header = json.loads(whole[8 : 8 + n_header])
     change(header)
@@ -75,5 +75,5 @@ def change_header(whole: bytes, change: Callable[[dict[str, Any]], object]) -> b
 
 
 def with_header(header: bytes, tensors: bytes = b"") -> bytes:
-    """The bytes of a file of this header, whatever it says."""
+    """The bytes of a file with the given header, valid or not."""
     return len(header).to_bytes(8, "little") + header + tensors

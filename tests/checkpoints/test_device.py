@@ -1,4 +1,4 @@
-"""Where the networks compute: on the CPU without a GPU, refused where one was asked for in vain."""
+"""Device of the networks: the CPU without a GPU, and a refusal if a missing GPU was requested."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from g3r.errors import InputError
 
 @pytest.fixture(params=[True, False], ids=["CPU build", "CUDA build"])
 def build(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether torch was built for CPUs alone."""
+    """The torch build: for CPUs only, or for GPUs."""
     monkeypatch.setattr(device, "knows_no_gpu", lambda: request.param)
     return bool(request.param)
 

@@ -1,4 +1,4 @@
-"""A network in its file: what ships is loaded when it is asked for, anything else at once."""
+"""Stored networks: the shipped ones are loaded on first use, all others immediately."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_its_record_and_template_are_those_of_the_network(name: str | None) -> N
 
 
 def plain(value: object) -> object:
-    """As JSON has it: no tuples."""
+    """The record as JSON returns it, without tuples."""
     if isinstance(value, dict):
         return {key: plain(one) for key, one in value.items()}
     return [plain(one) for one in value] if isinstance(value, list | tuple) else value

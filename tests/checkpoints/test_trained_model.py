@@ -1,4 +1,4 @@
-"""Priors and pose networks as files: what goes in comes out, and what is damaged is refused."""
+"""Priors and pose networks as files: saving and loading preserve them, and damaged files are refused."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / f"{name}.safetensors" for name in MODELS}
 
 
-def test_round_trip(model: TrainedModel, saved: dict[str, Path]) -> None:
+def test_loading_a_saved_model_restores_record_and_weights(model: TrainedModel, saved: dict[str, Path]) -> None:
     path = saved[model.kind]
     loaded = type(model).load(path)
     assert loaded.record() == model.record()
@@ -52,7 +52,7 @@ def test_round_trip(model: TrainedModel, saved: dict[str, Path]) -> None:
 
 
 def test_saving_what_was_loaded_writes_the_same(model: TrainedModel, saved: dict[str, Path], tmp_path: Path) -> None:
-    """Whatever the memory format of the loaded weights."""
+    """This holds for any memory format of the loaded weights."""
     type(model).load(saved[model.kind]).save(tmp_path / "twin.safetensors")
     assert (tmp_path / "twin.safetensors").read_bytes() == saved[model.kind].read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["twin.safetensors"]
@@ -102,7 +102,7 @@ SHIPPED: dict[tuple[type[TrainedModel], str | None], str] = {
 
 @pytest.mark.parametrize(("kind", "name"), SHIPPED)
 def test_the_shipped_weights(kind: type[TrainedModel], name: str | None) -> None:
-    """They have kept every value: the checksum is the one that their training's export wrote."""
+    """Their checksum is the one written by the export of their training, so every value is unchanged."""
     shipped = kind.load(name)
     assert shipped.file_name == weights_path(name, kind.kind).name
     assert shipped.weights_sha256.startswith(SHIPPED[kind, name])
@@ -222,7 +222,7 @@ def test_refusal_of_a_truncated_file(model: TrainedModel, saved: dict[str, Path]
 
 
 def test_refusal_of_flipped_bits(model: TrainedModel, saved: dict[str, Path], tmp_path: Path) -> None:
-    """At the end of the file there are weights."""
+    """The bits are flipped at the end of the file, which holds weights."""
     content = bytearray(saved[model.kind].read_bytes())
     for position in range(len(content) - 16, len(content)):
         content[position] ^= 0x10

@@ -1,4 +1,4 @@
-"""The format of exported weights: what a header claims is checked before memory is taken."""
+"""The file format of exported weights: header claims are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "a.safetensors"
 
 
-def test_round_trip(file: Path) -> None:
+def test_written_weights_are_read_back_with_description_values_and_dtypes(file: Path) -> None:
     found = read_weights(file, "prior")
     assert found.description == SAID
     tensors = found.tensors()
@@ -96,7 +96,7 @@ def test_a_header_that_lies_is_refused_before_the_file_is_read(name: str, file: 
     "offsets", [[0, 24], [8, 32], [4, 28], [-24, 0], [0, 10**30], [24, 0]], ids=lambda offsets: str(offsets)
 )
 def test_offsets_that_overlap_or_leave_gaps(offsets: list[int], file: Path) -> None:
-    """The library finds these when the tensors are decoded."""
+    """The safetensors library detects these while it decodes the tensors."""
     file.write_bytes(change_header(file.read_bytes(), lambda header: header["a"].update(data_offsets=offsets)))
     found = read_weights(file, "prior")
     if offsets != found_offsets():

@@ -161,7 +161,7 @@ def test_presets_without_a_fit_are_passed_over_and_every_fit_is_kept(monkeypatch
     assert list(found["fits"]) == ["fast"]
     n_labels = sum(map(len, found["sweeps"].values()))
     assert len(fitted) > 10
-    assert len(set(kept)) == 1 + n_labels  # every time it holds more
+    assert len(set(kept)) == 1 + n_labels  # the record grows every time
 
 
 def test_scaling_measures_what_grows(tmp_path: Path) -> None:

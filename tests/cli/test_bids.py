@@ -1,4 +1,4 @@
-"""`g3r-bids`: what it refuses before it starts anything."""
+"""`g3r-bids`: refusals before it starts any process."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_folders_that_cannot_be(raw: Path, tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.parametrize("end", ["", "/", "/../raw/."])
 def test_the_description_names_no_folder_above(raw: Path, tmp_path: Path, end: str) -> None:
-    """Whatever way the paths are written, those of g3r-infer, too; other words stay as they are."""
+    """For any way of writing paths, including those for g3r-infer; other words are unchanged."""
     out, secret = tmp_path / "out", "/data/secret/of study"
     words = ["group", "--slurm", f"partition=a,container={secret}/x", f"--mask-derivative={secret}/m"]
     infer = ["--preset", "fast", "--mask-command", f"{secret}/tool {{stack}} {{mask}}", f"--ckpt={secret}/prior.st"]

@@ -1,4 +1,4 @@
-"""`g3r-export` that is interrupted or has no memory."""
+"""`g3r-export` when it is interrupted or runs out of memory."""
 
 from __future__ import annotations
 

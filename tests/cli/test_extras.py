@@ -1,4 +1,4 @@
-"""Commands without the packages of their extra: one line that says what to install."""
+"""Commands without the packages of their extra end with one line that names what to install."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`g3r-infer` as a process: its outputs; the same from Python."""
+"""`g3r-infer` as a process and from Python: outputs and record."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ def inputs(subject: Path) -> list[object]:
 
 @pytest.fixture(scope="module")
 def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that g3r-infer wrote for the subject."""
+    """Output folder of g3r-infer for the subject."""
     folder = tmp_path_factory.mktemp("reconstructed") / "deep" / "out"
     before = {path: path.read_bytes() for path in subject.iterdir()}
     done = run("infer", *inputs(subject), *QUICK, "--output", folder)
@@ -68,7 +68,7 @@ def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path) -> 
     data, inside = np.asarray(volume.dataobj), np.asarray(mask.dataobj) > 0
     assert data.dtype == np.float32
     assert np.isfinite(data).all()
-    # the image reaches about a voxel beyond the mask
+    # the image extends about one voxel beyond the mask
     assert (data[~binary_dilation(inside, iterations=3)] == 0).all()
     assert (data[inside] != 0).mean() > 0.99
     truth_mask = load_volume(subject / "truth-mask.nii.gz")
@@ -79,7 +79,7 @@ def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path) -> 
     maps = [load_volume(reconstructed / f"{name}.nii.gz") for name in ("prior", "coarse", "density")]
     assert len({one.data.shape for one in maps}) == 1
     # without a network the Gaussians start from V_sharp: the same head as V_coarse, with more contrast
-    head = binary_erosion(inside)  # slices look at background, too; without a network all maps have one grid
+    head = binary_erosion(inside)  # slices also cover background; without a network all maps have the same grid
     sharp, coarse = (one.data[head] for one in maps[:2])
     assert np.corrcoef(sharp, coarse)[0, 1] > 0.9
     assert sharp.std() > 1.02 * coarse.std()
@@ -158,7 +158,7 @@ def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: P
 
 
 def quick_settings() -> ReconstructionSettings:
-    """Without the prior and with a short registration and fit."""
+    """Settings without the prior and with a short registration and fit."""
     return replace(
         QUICK_FIT,
         resolution_mm=1.5,
@@ -176,7 +176,7 @@ def given(subject: Path) -> list[Stack]:
 
 @pytest.fixture(scope="module")
 def plain(given: list[Stack]) -> ReconstructionResult:
-    """What they give, in one call."""
+    """Their reconstruction in one call."""
     return GaussianReconstructor(settings=quick_settings()).reconstruct(given)
 
 
@@ -200,7 +200,7 @@ def test_one_registration_serves_several_fits(given: list[Stack], plain: Reconst
 def test_intensities_scale_the_volume_and_nothing_else(
     given: list[Stack], plain: ReconstructionResult, power: int
 ) -> None:
-    """A power of two (about 1e-6 and 1e6) rounds nothing: no constant may have a hidden unit."""
+    """Powers of two (about 1e-6 and 1e6) cause no rounding, so any difference shows a constant with a hidden unit."""
     factor = np.float32(2.0**power)
     scaled = GaussianReconstructor(settings=quick_settings()).reconstruct(
         [replace(stack, image=stack.image * factor) for stack in given]
@@ -211,7 +211,7 @@ def test_intensities_scale_the_volume_and_nothing_else(
 
 @pytest.mark.parametrize("standard", [False, True])
 def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path, standard: bool) -> None:
-    """All slices stay in line; as a whole they are turned only where the standard orientation is wanted."""
+    """All slices stay in line; together they are rotated only if the standard orientation is requested."""
     stack = load_stack(files(subject, "stack")[0], files(subject, "mask")[0], 4.0)
     settings = quick_settings()
     settings = replace(settings, registration=replace(settings.registration, standard_orientation=standard))
@@ -219,7 +219,7 @@ def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path,
     assert any("single stack" in note for note in result.record.notes)
     motion = result.slices.world_from_header()
     relative = motion.take([0]).inverse() @ motion if standard else motion
-    np.testing.assert_allclose(relative.translation_mm, 0, atol=0.02)  # headers are read to that
+    np.testing.assert_allclose(relative.translation_mm, 0, atol=0.02)  # the tolerance of header geometry
     np.testing.assert_allclose(relative.rotvec_rad(), 0, atol=2e-4)
     assert result.record.registration is not None
     assert result.record.registration.space == ("standard" if standard else "scanner")

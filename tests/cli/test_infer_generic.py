@@ -1,4 +1,4 @@
-"""`g3r-infer --anatomy generic`: stacks of an object that is no brain."""
+"""`g3r-infer --anatomy generic`: stacks of an object that is not a brain."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def run(case: Path, output: Path, *options: str) -> int:
 
 
 def pose_error_mm(case: Path, output: Path) -> float:
-    """Median over points of the slices, as g3r-evaluate writes it."""
+    """Median pose error over points of the slices, as written by g3r-evaluate."""
     line = ["--poses", case / "poses.tsv", "--slices", output / "slices.tsv", "--json", output / "scores.json"]
     truth = ["--volume", output / "volume.nii.gz", "--reference", case / "truth.nii.gz", "--align"]
     assert evaluate.main([*map(str, [*line, *truth, "--mask", case / "truth-mask.nii.gz"])]) == 0

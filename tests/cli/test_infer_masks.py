@@ -1,4 +1,4 @@
-"""`g3r-infer` without masks, with some, and with a masker of the user's."""
+"""`g3r-infer` without masks, with masks for some stacks, and with the user's mask command."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ shutil.copy(sys.argv[1].replace("stack-", "mask-"), sys.argv[2])
 
 @pytest.fixture
 def masker(tmp_path: Path) -> str:
-    """A command that finds the mask beside the stack."""
+    """A mask command that copies the mask beside the stack."""
     (tmp_path / "masker.py").write_text(LOOK_BESIDE)
     return f"{sys.executable} {tmp_path / 'masker.py'} {{stack}} {{mask}}"
 
 
 @pytest.fixture(scope="module")
 def surrounded(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The subject's stacks with something around the brain, and its masks."""
+    """The subject's stacks with surroundings added around the brain, and its masks."""
     folder = tmp_path_factory.mktemp("surrounded")
     for path in files(subject, "stack"):
         image = nib.Nifti1Image.from_filename(path)
@@ -44,7 +44,7 @@ def surrounded(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_masker_makes_what_is_not_given(surrounded: Path, masker: str, tmp_path: Path) -> None:
-    """The same volume as with all masks given; the found ones are written, and named in record and terminal."""
+    """The volume equals that with all masks given; found masks are written, and named in record and terminal."""
     stacks, masks = files(surrounded, "stack"), files(surrounded, "mask")
     given = run("infer", "--stacks", *stacks, "--masks", *masks, *QUICK, "--output", tmp_path / "given")
     assert given.returncode == 0, given.stderr
@@ -90,7 +90,7 @@ def test_the_whole_image_is_brain_where_the_user_says_so(surrounded: Path, tmp_p
 
 @pytest.fixture(scope="module")
 def headless(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two stacks of the size of a mother, with smooth noise in them and no head."""
+    """Two stacks of the size of a mother, with smooth noise and no head."""
     folder, rng = tmp_path_factory.mktemp("headless"), np.random.default_rng(0)
     for n in range(2):
         data = gaussian_filter(rng.normal(size=(100, 100, 20)), (6, 6, 2))

@@ -1,4 +1,4 @@
-"""A stack that does not fit the others: left out and named, or kept at the user's word."""
+"""A misfit: left out and named, or kept at the user's request."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.cli.test_infer import QUICK, files, run
 
 @pytest.fixture(scope="module")
 def spoilt(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The subject's stacks, of which the second has the pixels of its brain in any order."""
+    """The subject's stacks; the brain pixels of the second one are permuted at random."""
     folder = tmp_path_factory.mktemp("spoilt")
     for path in [*files(subject, "stack"), *files(subject, "mask")]:
         shutil.copy(path, folder)
@@ -31,7 +31,7 @@ def spoilt(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def reconstructed(folder: Path, out: Path, *options: str, without: int | None = None) -> tuple[dict[str, Any], str]:
-    """The record of a run, and what the terminal said."""
+    """The record of a run, and its terminal output."""
     stacks, masks = ([one for n, one in enumerate(files(folder, kind)) if n != without] for kind in ("stack", "mask"))
     done = run("infer", "--stacks", *stacks, "--masks", *masks, *QUICK, *options, "--output", out)
     assert done.returncode == 0, done.stderr
@@ -54,7 +54,7 @@ def test_the_volume_is_that_of_the_others_and_the_stack_is_named(spoilt: Path, t
     assert "<b>left out</b>" in page
 
     reconstructed(spoilt, tmp_path / "two", without=1)
-    # as near as two searches with other random numbers come to each other: 0.954 on one machine, above 0.98 on others
+    # as similar as two searches with different random numbers: 0.954 on one machine, above 0.98 on others
     ours, theirs = (load_volume(tmp_path / name / "volume.nii.gz") for name in ("all", "two"))
     moved = resample(ours, theirs.grid)
     assert np.corrcoef(moved[theirs.data > 0], theirs.data[theirs.data > 0])[0, 1] > 0.93

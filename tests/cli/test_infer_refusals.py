@@ -1,4 +1,4 @@
-"""`g3r-infer` refuses: bad input with exit code 3, bad options with 2, each in one line."""
+"""Refusals of `g3r-infer`: bad input with exit code 3, bad options with 2, each in one line."""
 
 import gzip
 from dataclasses import replace
@@ -16,7 +16,7 @@ from tests.cli.test_infer import files, inputs, run
 
 
 def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], str]:
-    """Arguments that must be refused, and the name that the message must hold."""
+    """Arguments that must be refused, and a name that the message must contain."""
     stacks, masks = files(subject, "stack"), files(subject, "mask")
     image = nib.Nifti1Image.from_filename(stacks[0])
     data, bad = np.asarray(image.dataobj), folder / "bad.nii.gz"

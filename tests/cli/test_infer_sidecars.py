@@ -1,4 +1,4 @@
-"""Sidecars and `g3r-infer`: who decided the thickness is on the terminal and in run.json, and can be repeated."""
+"""Sidecars and `g3r-infer`: the source of the thickness is shown, recorded in run.json, and can be repeated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIDECAR = {"SliceThickness": 3.5, "SpacingBetweenSlices": 4, "PhaseResolution": 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
-    """A case that is reconstructed in about a second; without sidecars."""
+    """A case without sidecars that is reconstructed in about a second."""
     return make_small_case(tmp_path_factory.mktemp("small-case"))
 
 
@@ -72,8 +72,8 @@ def test_a_sidecar_is_never_replaced(subject: Path, tmp_path: Path, capsys: pyte
 
 
 def test_a_run_is_repeated_without_its_sidecars(case: SmallCase, tmp_path: Path) -> None:
-    """From files with sidecars in Python; again by `--config`, from the same images alone."""
-    use_threads(1)  # as the commands below
+    """A run in Python with sidecars is repeated by `--config` from the images alone."""
+    use_threads(1)  # the same as in the commands below
     copied = with_sidecars(case.folder, tmp_path)
     stacks = [load_stack(*pair) for pair in zip(files(copied, "stack"), files(copied, "mask"), strict=True)]
     result = GaussianReconstructor(settings=RunRecord.read(case.config).settings).reconstruct(stacks)

@@ -1,4 +1,4 @@
-"""`g3r-mask` as a user runs it, with a masker of the user's in place of the network."""
+"""`g3r-mask` with the user's mask command in place of the network."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOOK_BESIDE = "import shutil, sys; shutil.copy(sys.argv[1].replace('_T2w', '_bes
 
 @pytest.fixture
 def stacks(subject: Path, tmp_path: Path) -> list[Path]:
-    """Three stacks with BIDS names, and beside the first two their masks."""
+    """Three stacks with BIDS names; masks lie beside the first two."""
     (tmp_path / "in").mkdir()
     paths = [tmp_path / "in" / f"sub-01_run-{n}_T2w.nii.gz" for n in range(3)]
     for n, path in enumerate(paths):
@@ -103,7 +103,7 @@ def test_a_number_of_threads_that_cannot_be(capsys: pytest.CaptureFixture[str]) 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM that can be heard")
 def test_a_job_that_is_cancelled_ends_its_masker(stacks: list[Path], tmp_path: Path) -> None:
-    """The masker, in a session of its own, says who it is, cancels the job and hangs."""
+    """The mask command runs in its own process session, writes its id, cancels the job and hangs."""
     script = "import os, signal, sys, time; open(sys.argv[3], 'w').write(str(os.getpid())); "
     script += "os.kill(os.getppid(), signal.SIGTERM); time.sleep(60)"
     (tmp_path / "masker.py").write_text(script)

@@ -1,4 +1,4 @@
-"""`g3r-pretrain` that is interrupted or has no memory, wherever its libraries say so."""
+"""`g3r-pretrain` when it is interrupted or runs out of memory, whichever library raises the error."""
 
 from __future__ import annotations
 

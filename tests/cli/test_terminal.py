@@ -1,4 +1,4 @@
-"""What g3r-infer says: a line per stage, the verdict last, a bar where there is a terminal, everything in log.txt."""
+"""Output of g3r-infer: a line per stage, the verdict last, a bar on a terminal, everything in log.txt."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.rooms import REPOSITORY
 STAGES = [
     "finding the brain: your 3 masks will be used",
     "reading the stacks: 3 stacks, ",
-    "finding the head: only 1 of 3 stacks agree",  # as quickly as they are registered here
+    "finding the head: only 1 of 3 stacks agree",  # because the registration in this test is so short
     "following the motion: ",
     "first volume: ",
     "comparing with other brains: not done",
@@ -159,7 +159,7 @@ def test_the_bar_ends_when_everything_is_written(
 
 
 def on_a_terminal(arguments: list[str], **environment: str) -> str:
-    """What the command writes to a terminal of 80 columns."""
+    """Output of the command on a terminal of 80 columns."""
     pty = pytest.importorskip("pty")
     import fcntl
     import struct
@@ -176,7 +176,7 @@ def on_a_terminal(arguments: list[str], **environment: str) -> str:
         while True:
             try:
                 part = os.read(ours, 65536)
-            except OSError:  # Linux says so that the other end is closed
+            except OSError:  # how Linux reports that the other end is closed
                 break
             if not part:
                 break
@@ -201,7 +201,7 @@ def test_no_color_is_respected(case: SmallCase, tmp_path: Path) -> None:
 
 def test_a_dumb_terminal_has_lines_alone(case: SmallCase, tmp_path: Path) -> None:
     said = on_a_terminal(loud(case, tmp_path / "out"), TERM="dumb")
-    assert "\x1b" not in said.removesuffix("\x1b[0m")  # colorama's goodbye, which some library loads
+    assert "\x1b" not in said.removesuffix("\x1b[0m")  # colorama's reset at exit, loaded by some library
     assert "finding the head: only 1 of 3 stacks agree" in said
 
 

@@ -1,4 +1,4 @@
-"""Share done and time left by a clock that the test moves."""
+"""Share done and time left, with a clock that the test controls."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_slow_machine_needs_longer_for_the_rest(clock: Clock, time_left: TimeL
 
 
 def test_many_steps_tell_better_than_the_clock(clock: Clock, time_left: TimeLeft) -> None:
-    time_left.begun("three")  # the others did not take place
+    time_left.begun("three")  # the earlier stages were skipped
     assert time_left.share() == pytest.approx(0.4)
     clock.now_s += 50
     time_left.progress(1, 100)

@@ -1,4 +1,4 @@
-"""The part of the brain that no slice saw: filled or left blank, and always said and written down."""
+"""The unseen part of the brain: filled or left blank, and always reported and recorded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ N_MISSING = 4
 
 @pytest.fixture(scope="module")
 def stack(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A stack and its mask, of which slices in the middle were blanked."""
+    """A stack with blanked slices in the middle, and its mask."""
     folder = tmp_path_factory.mktemp("missing")
     paths = []
     masked = np.asarray(nib.Nifti1Image.from_filename(subject / "mask-0.nii.gz").dataobj).any((0, 1))
@@ -79,10 +79,10 @@ def test_filled_the_unseen_part_is_brain_and_not_blank(stack: tuple[Path, Path],
     seen = result.mask & ~result.unseen
     assert (result.volume[result.unseen] > 0).mean() > 0.9
     assert result.volume[result.unseen].mean() == pytest.approx(result.volume[seen].mean(), rel=0.3)
-    # the whole stack has nothing unseen that is worth a word
+    # the complete stack has no unseen part worth reporting
     whole = reconstructor.reconstruct([load_stack(subject / "stack-0.nii.gz", subject / "mask-0.nii.gz", 4.0)])
     assert whole.record.unseen is not None
     assert whole.record.unseen.share < MENTIONED_ABOVE
     assert whole.record.unseen.line() is None
-    # and what was filled is about as large as what is there
+    # and the mask with the filled part is about as large as that of the complete stack
     assert result.mask.sum() == pytest.approx(whole.mask.sum(), rel=0.08)

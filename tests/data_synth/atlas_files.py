@@ -12,7 +12,7 @@ from data_synth.phantom import Phantom, fetal_brain_phantom
 from g3r.geometry import VolumeGrid
 
 SPOT_MM = (13.0, 11.0, 9.0)
-"""Right, anterior and superior of a phantom's middle, inside its head."""
+"""Position of the spot: right, anterior and superior of a phantom's centre, inside its head."""
 
 SPOT_RADIUS_MM = 6.0
 
@@ -22,7 +22,7 @@ def write_subject(
 ) -> None:
     made = fetal_brain_phantom(weeks, 3.0)
     t2, mask, affine = made.t2, made.mask.astype(np.uint8), made.affine
-    if affine_flip:  # the same brain stored the other way round
+    if affine_flip:  # the same brain stored with flipped axes
         affine = affine @ np.diag([-1.0, 1, 1, 1])
         affine[0, 3] = -affine[0, 3]
         t2, mask = t2[::-1], mask[::-1]
@@ -37,10 +37,10 @@ def write_marked_subject(folder: Path, weeks: float, axes: str) -> tuple[Phantom
     Args:
         folder: to write.
         weeks: of the phantom.
-        axes: of the files: "LPS" where the first index grows to the left, and so on.
+        axes: of the files, such as "LPS" if the first index grows to the left.
 
     Returns:
-        The phantom with the spot, and its labels: of tissue 1, `VENTRICLES` in the spot, 0 around the head.
+        The phantom with the spot, and its labels: `VENTRICLES` in the spot, 1 in the rest of the head, 0 around it.
     """
     made = fetal_brain_phantom(weeks, 3.0)
     place = VolumeGrid(made.t2.shape, made.affine).world(np.moveaxis(np.indices(made.t2.shape), 0, -1))

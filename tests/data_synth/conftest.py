@@ -1,4 +1,4 @@
-"""Heads that the tests of several modules slice and vary."""
+"""Heads that several test modules share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def centred_head() -> TruthVolume:
 
 @pytest.fixture(scope="session")
 def atlas(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with three subjects, in both namings."""
+    """A folder with three subjects, in both naming schemes."""
     root = tmp_path_factory.mktemp("atlas")
     write_subject(root / "a" / "week24", 24)
     write_subject(root / "a" / "week30", 30, affine_flip=True)

@@ -47,7 +47,7 @@ def test_the_generator_decides(stacks: list[SimulatedStack]) -> None:
     expected = torch.rand(3)
     torch.manual_seed(3)
     first = with_artefacts(stacks, 0.3, np.random.default_rng(2))
-    torch.testing.assert_close(torch.rand(3), expected, rtol=0, atol=0)  # torch's own generator is left alone
+    torch.testing.assert_close(torch.rand(3), expected, rtol=0, atol=0)  # torch's global generator is unchanged
     again = with_artefacts(stacks, 0.3, np.random.default_rng(2))
     assert not changed_slices(first, again).any()
     assert changed_slices(first, with_artefacts(stacks, 0.3, np.random.default_rng(3))).any()
@@ -67,7 +67,7 @@ def test_each_slice_of_a_stack_moves_by_itself() -> None:
 
 
 def test_motion_rings_within_the_slice(stacks: list[SimulatedStack], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A moved copy alone would be dark where the head never was; k-space taken from several poses rings there."""
+    """A moved copy alone would be dark beside the head; k-space from several poses causes ringing there."""
     monkeypatch.setattr(artefacts, "slice_artefacts", lambda: tio.RandomMotion(degrees=4, translation=3))
     moved = with_artefacts(stacks[:1], 1.0, np.random.default_rng(5))[0].stack
     still = stacks[0].stack

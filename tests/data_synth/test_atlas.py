@@ -1,4 +1,4 @@
-"""Atlas folders: what is found in them, and volumes in one convention."""
+"""Atlas folders: subjects found in them, and volumes in one convention."""
 
 from pathlib import Path
 from typing import Any
@@ -47,20 +47,20 @@ def test_atlas_volumes_come_canonical_and_normalised(atlas: Path) -> None:
 
 
 def seen_at_voxels_of(made: Phantom, volume: TruthVolume, values: NDArray[Any], order: int) -> NDArray[np.float64]:
-    """What a volume that was read shows where the voxels of the phantom lie in the world [I, J, K]."""
+    """Values [I, J, K] of a loaded volume at the world positions of the phantom's voxels."""
     world = VolumeGrid(made.t2.shape, made.affine).world(np.moveaxis(np.indices(made.t2.shape), 0, -1))
     index = VolumeGrid(volume.data.shape, volume.affine).index(world)
     return map_coordinates(np.asarray(values, np.float64), np.moveaxis(index, -1, 0), order=order, mode="constant")
 
 
 def center_mm(volume: TruthVolume, where: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """World position of the middle of some voxels."""
+    """World position of the centroid of some voxels."""
     return VolumeGrid(volume.data.shape, volume.affine).world(np.argwhere(where).mean(0))
 
 
 @pytest.mark.parametrize("axes", ["RAS", "LAS", "LPS", "PSR"])
 def test_a_head_is_not_mirrored_whatever_its_header(axes: str, tmp_path: Path) -> None:
-    """On its own grid every voxel, intensity and label, is where it was; in smaller voxels nearly so."""
+    """On its own grid every voxel keeps place, intensity and label; with another voxel size almost."""
     made, labels = write_marked_subject(tmp_path / "week24", 24, axes)
     expected = np.where(made.mask, made.t2 / np.percentile(made.t2[made.mask], 99.5), 0)
     (subject,) = find_subjects(tmp_path)
@@ -78,4 +78,4 @@ def test_a_head_is_not_mirrored_whatever_its_header(axes: str, tmp_path: Path) -
     for volume in (same, finer, cropped(finer, 2)):
         assert volume.ventricles is not None
         for marked in (volume.data > 0.7, volume.ventricles):
-            np.testing.assert_allclose(center_mm(volume, marked), SPOT_MM, atol=0.6)  # of 2 mm voxels; 26 if mirrored
+            np.testing.assert_allclose(center_mm(volume, marked), SPOT_MM, atol=0.6)  # 2 mm voxels; 26 if mirrored

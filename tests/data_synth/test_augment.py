@@ -1,4 +1,4 @@
-"""Variation of heads: still heads, and decided by the generator alone."""
+"""Augmentation of heads: the result is still a head, and depends only on the generator."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def test_augmentation_keeps_a_head(head: TruthVolume) -> None:
     transform = augmentation()
     for seed in range(4):
         varied = augmented(head, transform, np.random.default_rng(seed))
-        torch.rand(5)  # the global generator plays no part
+        torch.rand(5)  # the global generator has no effect
         again = augmented(head, transform, np.random.default_rng(seed))
         np.testing.assert_array_equal(varied.data, again.data)
         assert varied.data.dtype == np.float32

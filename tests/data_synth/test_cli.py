@@ -62,7 +62,7 @@ def test_a_subject_from_a_volume(volume: tuple[Path, Path], tmp_path: Path) -> N
         n_slices += image.shape[2]
     assert len(rows) == len(centers) == n_slices
     moved = 0.0
-    for row in rows:  # both files say the same about a point off the middle of its slice
+    for row in rows:  # both files put an off-centre point of a slice at the same place
         key = (int(row["stack"]), int(row["slice"]))
         image = nib.Nifti1Image.from_filename(output / f"stack-{key[0]}.nii.gz")
         index = np.array([3.0, 7.0, key[1]])
@@ -98,7 +98,7 @@ def test_a_phantom_and_what_is_already_there(tmp_path: Path) -> None:
 
 
 def test_what_an_empty_disk_holds_is_in_nobodys_way(tmp_path: Path) -> None:
-    for name in ("lost+found", ".unfinished"):  # the second is made by the run itself
+    for name in ("lost+found", ".unfinished"):  # ".unfinished" is made by the run itself
         (tmp_path / name).mkdir()
     check_output(tmp_path, replace=False)
 

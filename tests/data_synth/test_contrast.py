@@ -1,4 +1,4 @@
-"""Other contrasts of a labelled head."""
+"""Random contrasts of a labelled head."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def test_a_recoloured_head_keeps_its_tissues_apart(head: TruthVolume) -> None:
         means[label] = (head.data[inside].mean(), new.data[inside].mean())
     old, now = np.array(list(means.values())).T
     assert np.abs(old - now).max() > 0.05
-    # the structure inside a tissue is still there
+    # the structure inside a tissue is kept
     white = head.labels == 3
     assert np.corrcoef(head.data[white], new.data[white])[0, 1] > 0.5
     same = recoloured(head, np.random.default_rng(1))

@@ -1,4 +1,4 @@
-"""Varied heads: another shape, other contrasts, the same frame."""
+"""Varied heads: random shape and contrast in the same frame."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_bent_by_millimetres_not_more(centred_head: TruthVolume, rng: np.random.
 
 
 def test_intensities_follow_a_curve(centred_head: TruthVolume, rng: np.random.Generator) -> None:
-    """Equal intensities stay equal."""
+    """Equal intensities remain equal."""
     varied = recurved(centred_head, rng)
     order = np.argsort(centred_head.data[centred_head.mask])
     before, after = centred_head.data[centred_head.mask][order], varied.data[centred_head.mask][order]

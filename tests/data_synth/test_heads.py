@@ -1,4 +1,4 @@
-"""Subjects of a training: their ages by name, and that none is on both sides of it."""
+"""Training subjects: ages by name, and no overlap of training and validation."""
 
 from __future__ import annotations
 

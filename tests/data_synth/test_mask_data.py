@@ -1,4 +1,4 @@
-"""Batches for the mask network, and that every sample can be made again."""
+"""Batches for the mask network, and reproducibility of every sample."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_every_fifth_validation_scan_has_no_head(centred_head: TruthVolume) -> N
     assert made[3].wide_mask.max() > 0.5
 
 
-def test_batches(centred_head: TruthVolume) -> None:
+def test_training_batches_stack_images_and_masks_of_two_samples(centred_head: TruthVolume) -> None:
     data = MaskDataModule(
         wide_shape=(48, 48, 4), crop_shape=(48, 48, 4), samples_per_epoch=4, batch_size=2, val_samples=1
     )

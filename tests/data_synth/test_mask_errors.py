@@ -1,4 +1,4 @@
-"""What surrounds a head, and masks that reach into it or miss a part."""
+"""Surroundings of a head, and masks that reach into them or lack a part of the head."""
 
 import numpy as np
 import pytest
@@ -37,10 +37,10 @@ def test_the_rim_is_as_wide_as_drawn_whatever_the_pixels(head: TruthVolume, grow
     for seed in range(5):
         (changed,) = with_mask_errors(stacks, np.random.default_rng(seed), grow)
         differs = (changed.stack.mask != before)[:, :, k]
-        # steps of the rim are those of a taxicab
+        # the rim grows in steps of the taxicab metric
         away = distance_transform_cdt(~before[:, :, k] if grow else before[:, :, k], metric="taxicab")
         width_mm = away[differs].max() * pixel_mm
         drawn_mm = np.random.default_rng(seed).uniform(0.2, 1.0) * (RIM_MM if grow else MISSED_MM)
-        # to the nearest pixel, and at least one
+        # rounded to the nearest pixel, at least one
         assert abs(width_mm - drawn_mm) <= max(pixel_mm / 2, pixel_mm - drawn_mm) + 1e-9
         assert differs[away == 1].all()

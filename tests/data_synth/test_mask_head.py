@@ -1,4 +1,4 @@
-"""Heads of scenes: closed masks and the layers about them."""
+"""Heads of scenes: filled masks and the layers around them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_every_layer_is_there_and_skull_encloses_the_brain(layered: SceneHead) -
     assert share[Tissue.BRAIN] > share[Tissue.SKULL]
     inner = np.isin(layered.labels, (Tissue.BRAIN, Tissue.CSF))
     around = binary_dilation(inner) & ~inner
-    assert (layered.labels[around] == Tissue.SKULL).mean() > 0.95  # but where it is thinner than half a voxel
+    assert (layered.labels[around] == Tissue.SKULL).mean() > 0.95  # except where it is thinner than half a voxel
 
 
 def test_the_mask_is_brain_and_outer_fluid(layered: SceneHead) -> None:

@@ -1,4 +1,4 @@
-"""Scans of scenes: the mask is where the head is, and the field of view ends where it should."""
+"""Scans of scenes: position of the mask, limits of the field of view, samples and artefacts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def whole(scan: Scan, pixel_mm: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_mask_holds_the_head(scene: Scene, seed: int) -> None:
-    """Sums over whole scans have the head's volume unless the scan cuts it."""
+    """Mask volumes of whole scans equal the head's volume unless the scan cuts it."""
     scan = draw_scan(scene, np.random.default_rng(seed), negative=False)
     image, inside = whole(scan)
     assert image.shape == inside.shape
@@ -59,7 +59,7 @@ def test_the_mask_has_the_head_s_volume_where_nothing_cuts_it(
 def test_negatives_have_empty_masks_and_are_no_empty_images(scene: Scene, seed: int) -> None:
     scan = draw_scan(scene, np.random.default_rng(seed), negative=True)
     image, inside = whole(scan)
-    assert (inside > 0.5).sum() * 9 * scan.spacing_mm / 1000 < 5  # a moving head may peep in
+    assert (inside > 0.5).sum() * 9 * scan.spacing_mm / 1000 < 5  # a moving head may enter the field of view
     assert (image > 0).mean() > 0.01
 
 
@@ -78,7 +78,7 @@ def test_a_part_of_a_scan_is_the_same_part_of_the_whole(scene: Scene) -> None:
     np.testing.assert_allclose(part, all_of_it[10:40, :, 3:7], atol=2e-4)
 
 
-def test_samples(scene: Scene) -> None:
+def test_samples_have_the_stated_shapes_and_crops_lie_near_the_head(scene: Scene) -> None:
     rng = np.random.default_rng(4)
     sample = draw_sample(draw_scan(scene, rng, negative=False), rng, **SHAPES)  # type: ignore[arg-type]
     assert sample.wide_image.shape == sample.wide_mask.shape == (64, 64, 6)
@@ -86,7 +86,7 @@ def test_samples(scene: Scene) -> None:
     for image in (sample.image, sample.wide_image):
         assert np.isfinite(image).all()
         assert image.dtype == np.float32
-    # the crop is about the head
+    # the crop is centred near the head
     at = np.argwhere(sample.mask > 0.5)[:, :2].mean(0)
     assert np.abs(at - 31.5).max() * 2.4 < 40
 
@@ -111,7 +111,7 @@ def test_artefacts_keep_shape_and_are_reproducible(rng: np.random.Generator) -> 
 def test_artefacts_stay_within_their_slice(
     seed: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Slices are taken one by one: what one shows reaches no other, motion while it is taken included."""
+    """Artefacts are applied slice by slice, so no slice affects another, motion artefacts included."""
     monkeypatch.setattr(mask_samples, "MOTION_SHARE", 1.0)
     image = rng.random((24, 20, 5)).astype(np.float32)
     other = image.copy()

@@ -1,4 +1,4 @@
-"""What is around the head of a scene, and its intensities."""
+"""Surroundings of the head of a scene, and their intensities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_mother_with_a_fetus_in_her(seed: int) -> None:
     for tissue in (Tissue.AMNIOTIC, Tissue.FETAL_BODY, Tissue.UTERUS, Tissue.FAT, Tissue.MUSCLE):
         assert share[tissue] > 1e-4, tissue
     assert np.isclose(made.texture.std(), 1, atol=0.5)
-    # the head's place is within the cube, and the trunk below it
+    # the head lies within the cube, and the trunk below it
     index = np.linalg.solve(made.affine[:3, :3], -made.affine[:3, 3])
     assert ((index > 0) & (index < 2 * HALF_MM / SPACING_MM)).all()
     assert made.trunk_mm[2] < BASE_MM[2]
@@ -38,7 +38,7 @@ def test_fluid_is_bright_and_bone_dark_in_most_scans(rng: np.random.Generator) -
 
 
 @pytest.mark.parametrize("step", [1.0, 4.0])
-def test_noise(step: float, rng: np.random.Generator) -> None:
+def test_noise_on_a_coarse_lattice_correlates_between_neighbours(step: float, rng: np.random.Generator) -> None:
     noise = lattice_noise((30, 31, 32), step, rng)
     assert noise.shape == (30, 31, 32)
     assert 0.5 < noise.std() < 1.5

@@ -1,4 +1,4 @@
-"""How heads move during a stack."""
+"""Motion of heads during a stack."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Ventricles that grow, and lesions."""
+"""Enlarged ventricles, and lesions."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The procedural brain: what is in it, how it grows, and that it is reproducible."""
+"""The procedural brain: tissues, growth with age, reproducibility."""
 
 import functools
 
@@ -24,7 +24,7 @@ def extent_mm(mask: np.ndarray) -> np.ndarray:
 
 
 def folding(one: Phantom) -> float:
-    """Brain surface over the surface of a ball of the same volume (in voxel faces)."""
+    """Ratio of the brain's surface to that of a ball of the same volume (in voxel faces)."""
     brain = np.isin(one.labels, [LABELS[n] for n in ("cortical_plate", "white_matter", "deep_grey", "ventricles")])
     faces = sum(int((np.diff(brain.astype(np.int8), axis=axis) != 0).sum()) for axis in range(3))
     return faces / float(brain.sum()) ** (2 / 3)
@@ -89,7 +89,7 @@ def test_grid_is_ras_and_centred() -> None:
     middle = one.affine @ [*((np.array(one.t2.shape) - 1) / 2), 1]
     np.testing.assert_allclose(middle[:3], 0, atol=1e-9)
     center = np.argwhere(one.labels == LABELS["cerebellum"]).mean(0) - (np.array(one.t2.shape) - 1) / 2
-    assert abs(center[0] * SPACING_MM) < 2  # in the middle, behind and below
+    assert abs(center[0] * SPACING_MM) < 2  # on the midline, behind and below the centre
     assert center[1] * SPACING_MM < -10
     assert center[2] * SPACING_MM < -8
 

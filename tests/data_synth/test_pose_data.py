@@ -1,4 +1,4 @@
-"""Batches of slice sets, and that every set can be made again."""
+"""Batches of slice sets, and reproducibility of every set."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_items_are_functions_of_seed_and_number() -> None:
     )
 
 
-def test_batches(centred_head: TruthVolume) -> None:
+def test_batches_number_stacks_by_set_and_validation_has_one_to_six_stacks(centred_head: TruthVolume) -> None:
     data = SliceSetDataModule(source="phantom", sets_per_epoch=3, batch_size=3, max_slices=12, val_sets=6)
     data.setup()
     for sets in (data.train_set, data.val_set):

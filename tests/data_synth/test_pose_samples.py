@@ -1,4 +1,4 @@
-"""Slice sets: images that truly show what their poses say, made as they would be at inference."""
+"""Slice sets: images that agree with their true poses, and with images made at inference."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def sampled(centred_head: TruthVolume) -> Head:
 
 
 def shown_at(sampled: Head, pose: RigidPose, size: int, pixel_mm: float) -> np.ndarray:
-    """The truth at the pixels' centres, by another interpolation."""
+    """The truth at the pixel centres, by an independent interpolation."""
     at = (np.arange(size) - (size - 1) / 2) * pixel_mm
     points = np.stack([*np.meshgrid(at, at, indexing="ij"), np.zeros((size, size))], -1)
     world = pose.apply(np.broadcast_to(points, (len(pose), *points.shape)))
@@ -42,7 +42,7 @@ def test_images_show_the_truth_at_their_poses(sampled: Head, rng: np.random.Gene
 def test_stacks_are_centred_by_their_headers(
     sampled: Head, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without motion the mean of a stack's masks, in its own axes, lies in the middle of its images."""
+    """Without motion, the centroid of a stack's masks, in its own axes, lies at the centre of its images."""
     monkeypatch.setattr(stack_planning, "LEVEL_SHARE", {"none": 1.0})
     monkeypatch.setattr(stack_planning, "TIMED_SHARE", 0.0)
     one = draw_slice_set(sampled, rng, max_slices=300, n_stacks=3, vary=False).images
@@ -56,7 +56,7 @@ def test_stacks_are_centred_by_their_headers(
 
 
 def test_the_same_images_as_at_inference(centred_head: TruthVolume, sampled: Head, rng: np.random.Generator) -> None:
-    """Stacks of the full simulator, read as at inference, look like the fast synthesis at the same poses."""
+    """Stacks of the full simulator, read as at inference, equal the fast synthesis at the same poses."""
     settings = [
         StackSettings(orientation=name, resolution_mm=1.0, thickness_mm=3.0, motion=LEVELS["mild"])
         for name in ("axial", "coronal")

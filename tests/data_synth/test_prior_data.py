@@ -81,7 +81,7 @@ def test_training_on_a_folder(atlas: Path) -> None:
 
 
 def seeds_of(subjects: SyntheticSubjects, epoch: int, index: int) -> tuple[int, ...]:
-    """What all draws of an item follow from."""
+    """Seeds of all random draws of an item."""
     seeds = subjects.draw(epoch, index)[1].bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
     return tuple(seeds)
 
@@ -103,7 +103,7 @@ def test_the_template_is_made_of_the_training_subjects_once(atlas: Path) -> None
     data = StackSynthesisDataModule(source=str(atlas), include=["a/*"], val_include=["b/*"], **TINY)
     template = data.template()
     assert data.template() is template
-    assert template.weeks.tolist() == [22, 25, 28, 31]  # of weeks 24 and 30, within two weeks
+    assert template.weeks.tolist() == [22, 25, 28, 31]  # the ages within two weeks of 24 and 30
     np.testing.assert_allclose(template.grid.spacing_mm, 3.0)
     np.testing.assert_allclose(template.grid.center_mm, 0, atol=1e-6)
 

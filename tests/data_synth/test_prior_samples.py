@@ -1,4 +1,4 @@
-"""Training subjects of the prior network: values, and that every one can be made again."""
+"""Training subjects of the prior network: their values and reproducibility."""
 
 import functools
 from pathlib import Path
@@ -49,7 +49,7 @@ def make_dataset(**options: Any) -> SyntheticSubjects:
 def test_a_sample_is_a_function_of_seed_epoch_and_index() -> None:
     straight, other_way = make_dataset(), make_dataset()
     a = straight.sample(2, 1)
-    torch.rand(5)  # the global generator plays no part
+    torch.rand(5)  # the global generator has no effect
     other_way.sample(0, 3)
     b = other_way.sample(2, 1)
     for key in IMAGE_KEYS:
@@ -99,7 +99,7 @@ def test_share_and_outline_are_shares_and_the_template_is_in_the_head_s_intensit
             assert share.dtype == np.float32
             assert 0 <= share.min() <= share.max() <= 1 + 1e-6
         seen = one.density > 0.8
-        # slices look at background too, and say so
+        # slices also cover background, whose brain share is zero
         assert (seen & ~one.mask).sum() > 0.2 * one.mask.sum()
         assert one.share[seen & one.mask].mean() > 0.85
         assert one.share[seen & ~one.mask].mean() < 0.3
@@ -110,7 +110,7 @@ def test_share_and_outline_are_shares_and_the_template_is_in_the_head_s_intensit
 
 
 def test_training_takes_a_template_of_another_age_and_validation_the_nearest() -> None:
-    """A template of the same age was made of the subject itself, or of its neighbours."""
+    """A template of the same age was made from the subject itself, or from its neighbours in age."""
     rng, near, far = np.random.default_rng(0), *OTHER_AGE_WEEKS
 
     def ages(weeks: float, in_order: bool) -> set[float]:
@@ -129,7 +129,7 @@ def test_training_takes_a_template_of_another_age_and_validation_the_nearest() -
         assert all(near <= abs(one - weeks) <= far for one in found)
     assert ages(23.0, in_order=True) <= {22.0, 25.0}
     assert ages(33.0, in_order=True) == {34.0}
-    # where no other age is near enough, the nearest has to do
+    # without another age in range, the nearest one is taken
     assert ages(50.0, in_order=False) == {float(template().weeks[-1])}
 
 
@@ -147,11 +147,11 @@ FIGURES = {
 
 
 def test_the_synthesis_is_the_one_that_its_version_stands_for() -> None:
-    # voxels fine enough that trilinear reading does not hide the profile of a pixel in plane
+    # voxels so fine that trilinear interpolation does not hide the in-plane pixel profile
     one = make_dataset(spacing_mm=1.2, in_order=True, artefact_share=0.0).sample(0, 2)
     found = {key: [float(f(getattr(one, key))) for f in (np.mean, np.std)] for key in IMAGE_KEYS}
     for key, figures in FIGURES.items():
-        # far above what rounding differs by between machines; the template's place is searched for, less exactly
+        # far above rounding differences between machines; the template's place comes from a search, which is less exact
         tolerance = 5e-3 if key in ("template", "outline") else 2e-4
         assert found[key] == pytest.approx(figures, rel=tolerance), (
             f"{key}: raise SYNTHESIS_VERSION (SIMULATOR_VERSION where slices changed), then put here {found}"
@@ -172,14 +172,14 @@ def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
     files = list(tmp_path.iterdir())
     assert len(files) == 1
     again = dataset(tmp_path)
-    again._synthesise = None  # type: ignore[method-assign,assignment]  # would fail if anything had to be made
-    for epoch in (0, 3):  # every epoch is the first one again
+    again._synthesise = None  # type: ignore[method-assign,assignment]  # would fail if any subject had to be made
+    for epoch in (0, 3):  # every epoch repeats the first one
         kept = again.sample(epoch, 1)
         for key in ("coarse", "density", "share", "sharp", "template", "outline", "truth"):
             np.testing.assert_allclose(getattr(kept, key), getattr(fresh, key), rtol=1e-3, atol=1e-6)
         np.testing.assert_array_equal(kept.mask, fresh.mask)
         assert (kept.n_stacks, kept.thickness_mm) == (fresh.n_stacks, fresh.thickness_mm)
-    # another spec does not take this one's files, and a damaged file is made again
+    # another spec does not use these files, and a damaged file is replaced
     cache = dataset(tmp_path, seed=8).cache
     assert cache is not None
     assert cache.load(0, 1) is None

@@ -1,4 +1,4 @@
-"""Settings of stacks as protocols have them."""
+"""Random acquisition settings of stacks."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Pose errors that registration leaves."""
+"""Simulated registration errors."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def test_residual_errors_have_the_stated_size() -> None:
         moved = np.linalg.norm(error.apply(center) - center, axis=1)
         lengths.append(np.sqrt((moved**2).mean()))
         angles.append(np.degrees(np.sqrt((error.rotvec_rad() ** 2).sum(1).mean())))
-    # 0.1 to 0.8 mm and 0.2 to 1.2 degrees, a third more for the tail
+    # 0.1 to 0.8 mm and 0.2 to 1.2 degrees, plus a third for the tail
     assert min(lengths) > 0.08
     assert max(lengths) < 1.6
     assert 0.35 < np.mean(lengths) < 0.55

@@ -1,4 +1,4 @@
-"""Slices against volumes whose slices are known in closed form, and poses against sampling."""
+"""The simulator against volumes whose slices are known in closed form, and against sampling at the true poses."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ LEVEL = replace(LEVELS["moderate"], offset_mm=2.0)
 
 
 def true_points_mm(one: SimulatedStack) -> np.ndarray:
-    """Where each pixel truly lies [I, J, K, 3]."""
+    """True position of each pixel [I, J, K, 3]."""
     shape = one.stack.image.shape
     header = one.stack.grid.world(np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1))
     return one.true_pose.apply(header.transpose(2, 0, 1, 3)).transpose(1, 2, 0, 3)
@@ -48,7 +48,7 @@ def deep(one: SimulatedStack, radius_mm: float = 15.0) -> np.ndarray:
 
 @pytest.mark.parametrize("profile", ["box", "gaussian", "sinc"])
 def test_a_ramp_is_seen_as_it_is(profile: Profile) -> None:
-    # any symmetric profile of unit integral leaves a linear function unchanged
+    # a symmetric profile of unit integral does not change a linear function
     slope = np.array([3.0, -2.0, 5.0])
     volume = (500 + (WORLD - GRID.center_mm) @ slope).astype(np.float32)
     settings = [
@@ -81,7 +81,7 @@ def test_a_blob_keeps_its_integral_and_widens_by_the_profile(profile: Profile, t
     d = np.einsum("ijkw,kwf->ijkf", true_points_mm(one) - GRID.center_mm, one.true_pose.rotation)  # axial frame
     expected = 1000 * np.sqrt(sigma_mm**6 / observed.prod()) * np.exp(-0.5 * (d**2 / observed).sum(-1))
     inside = deep(one)
-    # quadrature, trilinear reading that blurs differently within a voxel, and the box's own shape
+    # error of quadrature, of trilinear interpolation (whose blur varies within a voxel), and of the box's shape
     np.testing.assert_allclose(one.stack.image[inside], expected[inside], atol=8)
     assert abs(one.stack.image[inside].mean() / expected[inside].mean() - 1) < 2e-3
 
@@ -138,7 +138,7 @@ def test_generator_decides_everything() -> None:
         return stacks
 
     first, again, other = make(5), make(5, 3), make(6)
-    for a, b in zip(first, again, strict=False):  # a stack does not depend on how many follow it
+    for a, b in zip(first, again, strict=False):  # a stack does not depend on the number of stacks after it
         np.testing.assert_array_equal(a.stack.image, b.stack.image)
         np.testing.assert_array_equal(a.true_pose.translation_mm, b.true_pose.translation_mm)
     assert np.abs(first[0].true_pose.translation_mm - other[0].true_pose.translation_mm).max() > 0.1
@@ -177,7 +177,7 @@ def log_bias_field(bias: float, resolution_mm: float) -> np.ndarray:
     log = np.log(one.stack.image / 500, where=inside, out=np.zeros(shape))
     by_slice = np.ma.masked_array(log, ~inside)
     assert by_slice.count(2).max() > 8
-    assert np.ma.ptp(by_slice, axis=2).max() < 1e-5  # fixed to the scanner: the same in every slice
+    assert np.ma.ptp(by_slice, axis=2).max() < 1e-5  # fixed to the scanner, so the same in every slice
     x, y, log = x[inside], y[inside], log[inside]
     terms = np.stack([np.ones_like(x), x, y, x * y, x**2, y**2], 1)
     coefficients = np.linalg.lstsq(terms, log, rcond=None)[0]
@@ -196,7 +196,7 @@ def test_the_bias_field_is_a_quadratic_in_mm() -> None:
 
 @pytest.mark.parametrize("thickness_mm", [2.2, 4.5])
 def test_the_reach_is_a_length(thickness_mm: float) -> None:
-    for stretch in (0.95, 1.0, 1.05):  # as of the studies' subjects, whose slices are kept
+    for stretch in (0.95, 1.0, 1.05):  # as in the studies' subjects, whose slices are cached
         assert reach_voxels(np.diag([0.8 * stretch, 0.8, 0.8, 1]), thickness_mm) == 4
     for voxel_mm in (0.3, 0.5, 1.0, 1.6, 2.5):
         reach_mm = reach_voxels(np.diag([voxel_mm] * 3 + [1.0]), thickness_mm) * voxel_mm
@@ -218,7 +218,7 @@ def test_thick_slices_show_the_head_as_far_as_their_profile_reaches(voxel_mm: fl
     (one,) = simulate_stacks(volume, mask, affine, [settings], np.random.default_rng(0))
     n_i, n_j, n_k = one.stack.image.shape
     depth_mm = one.stack.affine[2, 3] + np.arange(n_k) * 1.0
-    # the soft-edged box through the slice, seen through a slab that ends half a voxel beyond its outer voxels
+    # a box with soft edges through the slice, cut by a slab that ends half a voxel beyond its outer voxels
     low_mm, high_mm = (n // 4 - 0.5) * voxel_mm, (3 * n // 4 - 0.5) * voxel_mm
     at = np.linspace(-0.6, 0.6, 2401) * thickness_mm
     profile = np.clip((0.6 - np.abs(at) / thickness_mm) / 0.2, 0, 1)

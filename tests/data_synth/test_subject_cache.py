@@ -1,4 +1,4 @@
-"""Subjects that are kept: only those of this version, whole, are taken."""
+"""Cached subjects: only complete ones of the current version are used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mean heads, and the heads they are made of."""
+"""Mean heads, and the heads that they are made from."""
 
 from pathlib import Path
 

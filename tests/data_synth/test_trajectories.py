@@ -1,4 +1,4 @@
-"""Motion in time: recorded, and modelled."""
+"""Motion in time: recorded and modelled."""
 
 from pathlib import Path
 

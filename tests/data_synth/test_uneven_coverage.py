@@ -1,4 +1,4 @@
-"""Parts of a head that no slice looks at: what is missing is missing, and all else stays where it was."""
+"""Simulated gaps in coverage: the intended parts are missing, and everything else is unchanged."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPACING_MM = np.array([2.0, 2.0, 3.0])
 
 
 def simulated(seed: int = 0, shape: tuple[int, int, int] = SHAPE) -> SimulatedStack:
-    """A stack of a ball in an oblique frame whose pixels all differ, and whose slices all moved."""
+    """A stack of a ball in an oblique frame with distinct pixel values, in which every slice moved."""
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1)
     mask = np.linalg.norm((index - (np.array(shape) - 1) / 2) * SPACING_MM, axis=-1) < 20
     affine = np.eye(4)
@@ -56,7 +56,7 @@ def only_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def placed_back(part: Stack, whole: Stack) -> tuple[np.ndarray, np.ndarray]:
-    """Image and mask of a smaller stack where they lie in the whole one; zero elsewhere."""
+    """Image and mask of a smaller stack at their place in the whole stack; zero elsewhere."""
     np.testing.assert_allclose(part.affine[:3, :3], whole.affine[:3, :3])
     first = np.linalg.inv(whole.affine) @ part.affine[:, 3]
     low = np.round(first[:3]).astype(int)
@@ -102,7 +102,7 @@ def test_a_stack_of_few_slices_keeps_them() -> None:
 
 @pytest.mark.usefixtures("only_cuts")
 def test_a_cut_takes_one_side_of_the_head() -> None:
-    """All that is left is half-space and mask, along one axis of the stack, by the share that was asked for."""
+    """The remaining mask is its intersection with a half-space along one axis, with the requested share cut off."""
     low, high = uneven_coverage.CUT
     sides, along = set(), set()
     for seed in range(40):
@@ -129,7 +129,7 @@ def test_a_cut_takes_one_side_of_the_head() -> None:
 
 @pytest.mark.usefixtures("only_cuts")
 def test_poses_keep_their_meaning_after_a_cut() -> None:
-    """A pixel that is left is truly where it was before: true poses are of the header's points."""
+    """Remaining pixels keep their true positions, because true poses refer to points by the header."""
     n_smaller = 0
     for seed in range(12):
         one = simulated(seed)
@@ -175,7 +175,7 @@ def test_shares_are_as_stated() -> None:
         untouched += all(a is b for a, b in zip(stacks, result, strict=True))
         cut += any(b.stack.image.shape != a.stack.image.shape for a, b in zip(stacks, result, strict=True))
     assert untouched / n == pytest.approx(uneven_coverage.EVEN_SHARE, abs=0.07)
-    # half or one in five of the others are cut, in plane by two of three directions or any of three stacks'
+    # half of the incomplete subjects, or one in five, are cut; in plane by two of three directions of any stack
     concerned = (1 - uneven_coverage.EVEN_SHARE) * (1 - (1 - uneven_coverage.CUT_SHARE) * (1 - 0.2))
     assert 0.6 * concerned < cut / n <= concerned + 0.05
 

@@ -1,4 +1,4 @@
-"""An examination of three oblique stacks with gaps, as DICOM and as NIfTI, among series that are no stacks."""
+"""An examination of three oblique stacks with gaps, as DICOM and as NIfTI, with series that are not stacks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MISSING = 6
 
 @dataclass(frozen=True)
 class Examination:
-    """Where everything is: DICOM; stacks with sidecars and masks as NIfTI; masks on the grids of dcm2niix."""
+    """Folders of the examination: DICOM; stacks with sidecars and masks as NIfTI; masks on the grids of dcm2niix."""
 
     dicom: Path
     stacks: list[Path]
@@ -38,7 +38,7 @@ class Examination:
 
 @pytest.fixture(scope="session")
 def examination(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Examination:
-    """Written once; tests do not write to it."""
+    """The examination, written once; tests must not write to it."""
     from tests.dicom.dicom_files import Study
 
     folder = tmp_path_factory.mktemp("examination")
@@ -76,20 +76,20 @@ def tilt() -> NDArray[np.float64]:
 
 
 def second_axis_flipped(data: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """The same image as dcm2niix stores it: rows from the last to the first."""
+    """The same image as stored by dcm2niix, with reversed rows."""
     flip = np.diag([1.0, -1.0, 1.0, 1.0])
     flip[1, 3] = data.shape[1] - 1
     return np.ascontiguousarray(data[:, ::-1]), affine @ flip
 
 
 def block(n_slices: int = 12) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
-    """A small image of nothing, and its affine."""
+    """A small image without content, and its affine."""
     rng = np.random.default_rng(n_slices)
     return rng.integers(1, 900, (10, 12, n_slices)).astype(np.int16), np.diag([1.5, 1.5, 4.0, 1.0])
 
 
 def _write_others(study: Any) -> None:
-    """Series that are not to be taken."""
+    """Write series that must not be chosen."""
     data, affine = block()
     turned = affine[:, [1, 2, 0, 3]]
     study.write(data, affine, LOCALISER, SeriesDescription="t2_haste_loc", thickness_mm=7)

@@ -18,14 +18,14 @@ generate_uid = pydicom.uid.generate_uid
 
 
 def decimal(value: float) -> str:
-    """A number as DICOM keeps it."""
+    """A number as a DICOM decimal string."""
     return pydicom.valuerep.format_number_as_ds(float(value))
 
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 CANARY = "Xenobia"
-"""In every text that is about the patient; it occurs nowhere else."""
+"""Word that is part of every text about the patient and occurs nowhere else."""
 
 PERSONAL: dict[str, str] = {
     "PatientName": f"{CANARY}^Q",
@@ -62,7 +62,7 @@ PERSONAL: dict[str, str] = {
 }
 
 TRACES = [word.encode() for word in (CANARY, "19870213", "20260814", "2026-08-14", "073519", "07:35:19", "DOE SERIES")]
-"""What must be nowhere in a result."""
+"""Texts that must not occur anywhere in a result."""
 
 SCANNER: dict[str, Any] = {
     "Modality": "MR",
@@ -84,7 +84,7 @@ SCANNER: dict[str, Any] = {
 
 @dataclass
 class Study:
-    """What all series of one examination share."""
+    """Common attributes of all series of one examination."""
 
     folder: Path
     personal: dict[str, str] = field(default_factory=lambda: dict(PERSONAL))
@@ -106,13 +106,13 @@ class Study:
         """Write a stack as one series, one file for each slice.
 
         Args:
-            image: [I, J, K] whole numbers.
+            image: [I, J, K] integers.
             affine: [4, 4] RAS+ mm from index.
             number: of the series.
             thickness_mm: of a slice.
-            missing: slices, from 0, that are left out.
+            missing: indices of slices that are left out.
             interleaved: whether instance numbers run over even slices, then odd ones.
-            tags: in place of those of `SCANNER`.
+            tags: replacements for those of `SCANNER`.
         """
         n_slices = image.shape[2]
         order = [*range(0, n_slices, 2), *range(1, n_slices, 2)] if interleaved else [*range(n_slices)]
@@ -123,7 +123,7 @@ class Study:
             if k in missing:
                 continue
             self.n_images += 1
-            # files of all series lie together, under names that say nothing
+            # files of all series are in one folder, with uninformative names
             path = self.folder / f"IM{self.n_images:05d}"
             one = _new_image(path)
             for name, value in {**self.personal, **SCANNER, "SeriesDescription": "DOE SERIES"}.items():

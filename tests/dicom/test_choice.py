@@ -1,4 +1,4 @@
-"""Which series of an examination are taken, and what is said of the others."""
+"""Choice of series of an examination, and the reasons for the others."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_the_stacks_are_taken_and_nothing_else(examination: Examination) -> None
         "6": (False, "3D acquisition"),
         "7": (True, ""),
         "8": (False, "fewer than 8 slices"),
-        # instance numbers run over even slices first: slice 7 of 12 is the fourth of them
+        # instance numbers run over every second slice first, from slice 1: slice 7 of 12 is the fourth of them
         "9": (False, "slice 7 of 12 is missing (image number 4)"),
         "10": (False, "echo-planar"),
     }
@@ -135,7 +135,7 @@ def test_what_cannot_be_taken_is_refused(examination: Examination, label: str, s
     ("missing", "says"),
     [
         ([3, 4, 8], "slices 4, 5, 9 of 12 are missing (image number 3, 5, 8)"),
-        ([11], None),  # nothing shows that there was one more
+        ([11], None),  # a missing last slice cannot be detected
     ],
 )
 def test_missing_slices_are_named(missing: list[int], says: str | None, tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_images_of_several_sizes_are_no_stack(tmp_path: Path) -> None:
 
 
 def test_damaged_headers_raise_nothing_else(tmp_path: Path) -> None:
-    """Bytes of headers are changed at random: a series is listed in some way, or the folder is refused."""
+    """With random changes of header bytes, a series is listed in some way, or the folder is refused."""
     paths = Study(tmp_path).write(*block(), 2)
     whole = [path.read_bytes() for path in paths]
     rng = np.random.default_rng(7)

@@ -1,4 +1,4 @@
-"""Series become NIfTI files on the places of their slices, and nothing of the patient comes along."""
+"""Conversion of series to NIfTI: correct geometry, and no information about the patient."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def series_of(folder: Path) -> dict[str, Series]:
 
 
 def test_stacks_are_where_the_nifti_files_put_them(examination: Examination, tmp_path: Path) -> None:
-    """Affines within 1e-3 mm, the same voxels, the exact thickness; names nowhere."""
+    """Affines agree within 1e-3 mm, voxels and thickness exactly, and no names occur."""
     series = series_of(examination.dicom)
     for number, source in zip(STACKS, examination.stacks, strict=True):
         path = convert(series[str(number)], tmp_path)
@@ -82,7 +82,7 @@ def test_names_with_spaces_and_odd_letters(tmp_path: Path) -> None:
 
 
 def test_what_dcm2niix_cannot_read_is_refused(tmp_path: Path) -> None:
-    """A cut file that the choice would have named: here it is cut later."""
+    """A truncated file, which the choice of series would name; here it is truncated afterwards."""
     paths = Study(tmp_path).write(*block(), 2)
     series = series_of(tmp_path)["2"]
     paths[3].write_bytes(paths[3].read_bytes()[:-100])
@@ -137,7 +137,7 @@ def test_the_folder_is_private_and_goes(tmp_path: Path, monkeypatch: pytest.Monk
         (folder / "series-1.nii").write_text("left")
     with pytest.raises(KeyboardInterrupt):
         interrupted_in_the_folder()
-    # a process of another machine may be running, whatever its number is here
+    # a process of another machine may still be running, whatever its id means here
     assert set(tmp_path.iterdir()) == {alive, elsewhere}
 
 

@@ -1,4 +1,4 @@
-"""`g3r-infer --dicom`: the same volume as by NIfTI, and nothing of the patient in it."""
+"""`g3r-infer --dicom`: the same volume as from NIfTI, and no information about the patient in the result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.dicom.dicom_files import LPS_FROM_RAS, TRACES, pydicom
 from tests.faults.small_case import WHOLE, quick_settings
 
 SERIES = [str(number) for number in STACKS]
-"""What is chosen without being asked for, too."""
+"""Series numbers that are also chosen by default."""
 
 COPY_MASK = """
 import pathlib, shutil, sys
@@ -42,7 +42,7 @@ shutil.copy(dict(pair.split("=", 1) for pair in of_series)[number], mask)
 
 
 def mask_command(examination: Examination, folder: Path) -> str:
-    """A tool that knows the masks of the series by their files' names."""
+    """A mask command that finds the masks of the series by their file names."""
     script = folder / "copy_mask.py"
     script.write_text(COPY_MASK)
     pairs = [f"{number}={path}" for number, path in zip(SERIES, examination.dicom_masks, strict=True)]
@@ -51,13 +51,13 @@ def mask_command(examination: Examination, folder: Path) -> str:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of a second, in scanner space."""
+    """Settings for runs of a second, in scanner space."""
     monkeypatch.setattr("g3r.cli.infer_task._settings", lambda options: quick_settings())
 
 
 @pytest.fixture(scope="module")
 def written(examination: Examination, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the result (`out`), the volume as DICOM (`series`) and what was said (`said.txt`)."""
+    """Folder with the result (`out`), the volume as DICOM (`series`) and the terminal output (`said.txt`)."""
     folder = tmp_path_factory.mktemp("written")
     options = ["--preset", "fast", "--no-prior", "--resolution", "3", "--threads", "1", "--space", "scanner"]
     masks = ["--mask-command", mask_command(examination, folder)]
@@ -69,7 +69,7 @@ def written(examination: Examination, tmp_path_factory: pytest.TempPathFactory) 
 
 
 def texts_below(folder: Path) -> dict[str, bytes]:
-    """Everything that was written and said, unpacked."""
+    """All written files and terminal output, uncompressed."""
     found = {}
     for path in folder.rglob("*"):
         if path.is_file():
@@ -87,7 +87,7 @@ def test_nothing_of_the_patient_is_in_the_result(written: Path) -> None:
     assert set(WHOLE) <= set(texts)
     assert not [name for name, content in texts.items() if any(word in content for word in TRACES)]
     assert not [path for path in (written / "out").iterdir() if any(word in str(path).encode() for word in TRACES)]
-    # the traces can be found: the one output that was asked to carry them does
+    # the search works: it finds the texts in the one output that is meant to contain them
     assert any(word in content for content in texts_below(written / "series").values() for word in TRACES)
 
 
@@ -142,7 +142,7 @@ def test_the_volume_is_that_of_the_nifti_route(examination: Examination, tmp_pat
 
 @pytest.mark.usefixtures("quick")
 def test_the_same_order_as_asked_for(examination: Examination, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the images that were converted are gone before the reconstruction begins."""
+    """The converted images are deleted before the reconstruction begins."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     work = GaussianReconstructor.reconstruct
@@ -187,7 +187,7 @@ def test_a_dry_run_shows_the_table_and_writes_nothing(
 
 
 def test_stacks_and_a_reference(examination: Examination, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a stack that does not fit and is kept nevertheless, so that there is something to remark."""
+    """A misfit is kept on request, so that there is a warning to write."""
     settings = quick_settings()
     settings = replace(settings, registration=replace(settings.registration, leave_out_misfits=False))
     monkeypatch.setattr("g3r.cli.infer_task._settings", lambda options: settings)

@@ -1,4 +1,4 @@
-"""What the system does not let be read in a folder of DICOM is counted, and said."""
+"""Unreadable files and folders in a folder of DICOM are counted and reported."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.dicom.dicom_files import Study
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One series, a link to itself that cannot be opened, and a folder that cannot be listed, even by root."""
+    """One series, a link to itself that cannot be opened, and a folder that not even root can list."""
     Study(tmp_path).write(*block(), 2)
     (tmp_path / "IM99999").symlink_to("IM99999")
     (tmp_path / "closed").mkdir()

@@ -1,4 +1,4 @@
-"""A volume as DICOM: geometry, values, what it refers to, what of the patient it repeats, whole or not at all."""
+"""A volume as DICOM: geometry, values, references, repeated patient attributes, atomic writing."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ KEPT = {"PatientName", "PatientID", "PatientBirthDate", "PatientSex", "PatientAg
     "AccessionNumber",
     "ReferringPhysicianName",
 }
-"""What belongs to the examination."""
+"""Attributes of the examination."""
 
 OURS = {"SeriesDate", "ContentDate", "ImageComments"}
-"""What is new in the series."""
+"""Attributes that are new in the series."""
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def study(tmp_path: Path) -> SourceStudy:
 
 
 def volume() -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Oblique, with another voxel size along each axis, so that no two axes can be exchanged unseen."""
+    """An oblique volume with different voxel sizes, so that exchanged axes are noticed."""
     rng = np.random.default_rng(5)
     data = rng.normal(300, 200, (7, 9, 5)).astype(np.float32)
     return data, tilt() @ np.diag([0.8, 0.9, 1.1, 1.0])
@@ -131,7 +131,7 @@ def test_flags_and_references(study: SourceStudy, tmp_path: Path) -> None:
 
 
 def test_the_frame_of_reference(study: SourceStudy, tmp_path: Path) -> None:
-    """The source's own in scanner space; in standard orientation the places mean something else."""
+    """In scanner space it is that of the source; in standard orientation positions have another meaning."""
     found = []
     for name, in_scanner_space in (("scanner", True), ("standard", False)):
         write_volume_series(tmp_path / name, *volume(), study, in_scanner_space=in_scanner_space)
@@ -146,7 +146,7 @@ def test_the_frame_of_reference(study: SourceStudy, tmp_path: Path) -> None:
 
 
 def read_moved(folder: Path) -> tuple[Any, ...]:
-    """Images of a patient who got up in between."""
+    """Images of a patient who left the scanner in between."""
     (folder / "second").mkdir()
     Study(folder / "second").write(*block(), 5)
     return tuple(read_images(folder / "second").images)
@@ -167,7 +167,7 @@ def test_names_keep_their_letters(tmp_path: Path) -> None:
     write_volume_series(tmp_path / "out", *volume(), read_study(tmp_path / "source"), in_scanner_space=True)
     one = read(tmp_path / "out")[0]
     assert one.PatientName == "Åsa^Müller"
-    assert one.AccessionNumber == one.StudyID == ""  # must be there, may be empty
+    assert one.AccessionNumber == one.StudyID == ""  # required attributes that may be empty
 
 
 def test_it_is_whole_or_not_at_all(study: SourceStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

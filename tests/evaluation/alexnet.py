@@ -1,4 +1,4 @@
-"""AlexNet with random weights: the mathematics of LPIPS does not depend on what it learned."""
+"""AlexNet with random weights, since the formula of LPIPS does not depend on the weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def random_states(seed: int = 0) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
 
 
 def save_states(folder: Path) -> None:
-    """Write both files as torchvision and the authors do."""
+    """Write both files in the formats of torchvision and of the authors."""
     features, heads = random_states()
     torch.save(features, folder / "alexnet-owt-7be5be79.pth")
     torch.save(heads, folder / "alex.pth")

@@ -1,4 +1,4 @@
-"""Rigid alignment: known motions are found, headers are respected, the result is repeatable."""
+"""Rigid alignment: recovery of known motions, use of headers, reproducibility."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHEAR[0, 1] = 0.2
 
 
 def brain(points_mm: np.ndarray) -> np.ndarray:
-    """An uneven ellipsoid with inner structure, defined at any world point [..., 3]."""
+    """An asymmetric ellipsoid with inner structure, defined at any world point [..., 3]."""
     x, y, z = np.moveaxis(points_mm, -1, 0)
     inside = 1 / (1 + np.exp(2.0 * (np.sqrt((x / 28) ** 2 + (y / 36) ** 2 + (z / 24) ** 2) - 1) * 12))
     texture = 500 + 160 * np.sin(x / 5 + 0.3 * y / 7) + 140 * np.cos(y / 6 + 1) + 120 * np.sin(z / 4 + x / 11)
@@ -134,7 +134,7 @@ def test_compare_with_and_without_alignment(rng: np.random.Generator) -> None:
     )
     assert headers.alignment is None
     assert headers.scores.psnr_db < 20
-    # interpolation smooths the noise a little, so the moved volume may score better than the still one
+    # interpolation smooths the noise slightly, so the moved volume may score better than the still one
     assert -0.3 < aligned.scores.psnr_db - compare(still, reference, mask).scores.psnr_db < 3
     assert np.abs(aligned.volume[mask].mean() / reference.data[mask].mean() - 1) < 0.01
 

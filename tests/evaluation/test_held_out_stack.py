@@ -1,4 +1,4 @@
-"""Stacks predicted by volumes that they did not help to make: in any pose and unit, by sharp ones better."""
+"""Prediction of held-out stacks by volumes, in any pose and unit, with better scores for sharp volumes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def truth(subject: Path) -> Volume:
 
 @pytest.fixture(scope="module")
 def stack(subject: Path) -> Stack:
-    """As it was simulated: each pixel averages over its own area."""
+    """A stack as simulated: each pixel averages over its own area."""
     loaded = load_stack(subject / "stack-0.nii.gz", subject / "mask-0.nii.gz", 4.0)
     return replace(loaded, in_plane_fwhm_pixels=(PIXEL_FWHM, PIXEL_FWHM))
 
@@ -79,7 +79,7 @@ def test_only_what_a_volume_shows_counts(truth: Volume, stack: Stack, by_truth: 
 
 
 def test_a_cut_volume_predicts_what_it_shows_as_well(truth: Volume, stack: Stack, by_truth: StackPrediction) -> None:
-    """What lies beyond the cut is no evidence: taken for zeros, it would draw slices inwards."""
+    """Voxels beyond the cut are not evidence; treated as zeros they would pull slices inwards."""
     cut = truth.data.copy()
     cut[:, : int(np.quantile(np.argwhere(cut != 0)[:, 1], 0.1))] = 0
     part = predict_stack(replace(truth, data=cut), stack)
@@ -111,11 +111,11 @@ def test_scores_of_a_slice(rng: np.random.Generator) -> None:
     noise = rng.normal(size=observed.shape)
     noisy = score(observed, observed + 2 * noise)
     assert noisy.mse == pytest.approx(1e-4, rel=0.15)
-    # a shade over the whole slice costs correlation, but not that of the detail
+    # smooth shading lowers the correlation, but not the correlation of detail
     shade = np.linspace(-40, 40, 50)
     shaded = score(observed, observed + shade)
     assert shaded.ncc < 0.75
     assert shaded.high_pass_ncc > 0.97
-    # pixels that do not count may hold anything
+    # ignored pixels may have any value
     beyond = np.where(counted, observed, 1e6)
     assert score(beyond, observed).ncc == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""LPIPS against the published values, against torchmetrics' code, and on volumes; weights are read or refused."""
+"""LPIPS: published values, agreement with torchmetrics, volumes, and reading of weights."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.rooms import REPOSITORY
 WEIGHTS = Path(os.environ.get("G3R_TEST_DATA", REPOSITORY.parent / "shared" / "data")) / "lpips"
 
 PUBLISHED = {"ex_p0.png": 0.722, "ex_p1.png": 0.138}
-"""Distances from ex_ref.png that the authors print (README of PerceptualSimilarity)."""
+"""Distances from ex_ref.png as published by the authors (README of PerceptualSimilarity)."""
 
 
 def images(n: int, seed: int = 1) -> Tensor:
@@ -42,7 +42,7 @@ def test_it_agrees_with_torchmetrics(monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = images(3), images(3, seed=2)
     with torch.no_grad():
         expected, found = other(one, two).flatten(), Lpips(features, heads)(one, two)
-    assert found.tolist() == pytest.approx(expected.tolist(), rel=1e-4)  # float32, sums in another order
+    assert found.tolist() == pytest.approx(expected.tolist(), rel=1e-4)  # float32 sums in a different order
     assert float(found.min()) > 0
 
 
@@ -62,7 +62,7 @@ def test_the_published_values() -> None:
     for name, value in PUBLISHED.items():
         assert float(lpips(read("ex_ref.png"), read(name))) == pytest.approx(
             value, abs=5e-4
-        )  # three digits are printed
+        )  # three digits are published
 
 
 def test_the_distance_of_volumes() -> None:

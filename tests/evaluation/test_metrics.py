@@ -22,7 +22,7 @@ def head(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plain(volume: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """The definition, recomputed over the whole arrays without any shortcut."""
+    """The scores by their definition, recomputed over the whole arrays without shortcuts."""
     truth = reference.astype(float) / np.percentile(reference[mask].astype(float), 99.9)
     design = np.stack([volume[mask].astype(float), np.ones(mask.sum())], axis=1)
     gain, offset = np.linalg.lstsq(design, truth[mask], rcond=None)[0]
@@ -67,7 +67,7 @@ def test_known_noise_gives_known_psnr(
     data_range = np.percentile(reference[mask], 99.9)
     volume = reference + rng.normal(0, noise_share * data_range, reference.shape)
     found = score(volume, reference, mask)
-    # the fit shrinks the noisy volume towards the mean: the error keeps the share NCC^2 of its variance
+    # the fit shrinks the noisy volume towards the mean, so the error keeps the share NCC^2 of its variance
     expected = -20 * np.log10(noise_share * found.ncc)
     assert found.psnr_db == pytest.approx(expected, abs=0.06)  # 3 sigma of the noise's own variance, 2e4 voxels
     assert found.data_range == pytest.approx(data_range, rel=1e-6)

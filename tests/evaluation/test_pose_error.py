@@ -1,4 +1,4 @@
-"""Target registration error: a common motion does not count, a slice's own error does."""
+"""Target registration error: independent of a common motion, sensitive to errors of single slices."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_known_shift_of_few_slices(points: dict[SliceKey, np.ndarray], rng: np.r
     keys = tuple(points)
     true = random_poses(rng, len(keys), 8, 4)
     shift = np.zeros((20, 3))
-    shift[3] = (30, 0, 0)  # a gross slice must not tilt the others
+    shift[3] = (30, 0, 0)  # a slice with a gross error must not tilt the others
     wrong = RigidPose(true.rotation, true.translation_mm + shift)
     found = target_registration_error(points, PoseTable(keys, true), PoseTable(keys, wrong))
     assert found.per_slice_mm[keys[3]] == pytest.approx(30, abs=0.1)
@@ -87,7 +87,7 @@ def test_tables_are_read(tmp_path: Path, rng: np.random.Generator) -> None:
 def test_points_come_from_slices_with_enough_mask(tmp_path: Path) -> None:
     mask = np.zeros((12, 10, 3), np.uint8)
     mask[2:10, 1:9, 1] = 1
-    mask[3:5, 3:5, 2] = 1  # four pixels: nobody can place it
+    mask[3:5, 3:5, 2] = 1  # four pixels are too few to place the slice
     affine = np.diag([-1.5, 1.0, 3.0, 1.0])
     affine[:3, 3] = (4, 5, 6)
     save_volume(tmp_path / "mask-0.nii.gz", mask, affine)

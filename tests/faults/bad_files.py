@@ -1,6 +1,6 @@
-"""Files that cannot be a stack, and files that cannot be the mask of the good one: name to (maker, message).
+"""Files that are not valid stacks, and files that are not valid masks of the good stack: name to (maker, message).
 
-A maker gets an empty folder and returns the file; the message is what the refusal must say (a pattern).
+A maker gets an empty folder and returns the file; the message is a pattern that the refusal must match.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Maker = Callable[[Path], Path]
 
 
 def header(name: str = "bad.nii.gz", **fields: Any) -> Maker:
-    """A file with header fields set to anything."""
+    """A file with header fields set to arbitrary values."""
     version = 2 if fields.pop("nifti2", False) else 1
     return lambda folder: write_raw(folder / name, None, fields, version=version)
 
@@ -32,7 +32,7 @@ def values(data: Callable[[], np.ndarray], name: str = "bad.nii.gz", affine: np.
 
 
 def content(name: str, data: Callable[[], bytes] | bytes) -> Maker:
-    """A file of these bytes."""
+    """A file with the given bytes."""
 
     def make(folder: Path) -> Path:
         path = folder / name
@@ -43,7 +43,7 @@ def content(name: str, data: Callable[[], bytes] | bytes) -> Maker:
 
 
 def packed(share: float = 1.0, flip: int | None = None) -> bytes:
-    """A good compressed file, a part of it, or one with a byte turned over."""
+    """A good compressed file, a truncated one, or one with an inverted byte."""
     whole = bytearray(gzip.compress(raw(), 1))
     if flip is not None:
         whole[flip] ^= 0xFF
@@ -69,7 +69,7 @@ def pipe(folder: Path) -> Path:
 
 
 def pair(cut: bool) -> Maker:
-    """A header whose voxels lie in another file that is cut off, or not there."""
+    """A header whose voxels lie in another file, which is truncated or missing."""
 
     def make(folder: Path) -> Path:
         nib.save(nib.Nifti1Pair(image(), AFFINE), folder / "bad.hdr")
@@ -84,7 +84,7 @@ def pair(cut: bool) -> Maker:
 
 
 def with_values(value: float, dtype: type = np.float32) -> Callable[[], np.ndarray]:
-    """The good image with a value in its middle."""
+    """The good image with a given value in its centre."""
 
     def make() -> np.ndarray:
         data: np.ndarray = image().astype(dtype)
@@ -111,7 +111,7 @@ NOT_READABLE, CUT_OFF = "not a readable NIfTI file", "voxels cannot be read.*cut
 GREY = [3, 24, 20, 8, 1, 1, 1, 1]
 
 BAD_STACKS: dict[str, tuple[Maker, str]] = {
-    # what is not a file
+    # not a file
     "missing": (lambda folder: folder / "bad.nii.gz", "no such file; check the path"),
     "missing folder": (lambda folder: folder / "no" / "bad.nii.gz", "no such file; check the path"),
     "below a file": (lambda folder: write(folder / "file.nii") / "bad.nii.gz", "cannot be read.*check"),
@@ -123,7 +123,7 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "device": (link("/dev/zero"), "pipe or device"),
     "name too long": (lambda folder: folder / ("bad" * 100 + ".nii"), "cannot be read"),
     "zero byte in the name": (lambda folder: folder / "bad\0.nii", "cannot be read"),
-    # what is not NIfTI
+    # not NIfTI
     "empty": (content("bad.nii.gz", b""), "it is empty"),
     "empty, plain": (content("bad.nii", b""), "it is empty"),
     "one byte": (content("bad.nii", b"x"), NOT_READABLE),
@@ -147,7 +147,7 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "plain, named .nii.gz": (content("bad.nii.gz", raw), "not compressed with gzip"),
     "header without voxel file": (pair(cut=False), "voxels cannot be read"),
     "voxel file cut off": (pair(cut=True), CUT_OFF),
-    # cut off and damaged
+    # truncated and damaged
     "cut in the header": (content("bad.nii.gz", lambda: packed(0.004)), NOT_READABLE),
     "cut in the header, plain": (content("bad.nii", lambda: raw()[:200]), NOT_READABLE),
     "cut after the header": (content("bad.nii", lambda: raw()[:352]), CUT_OFF),
@@ -202,7 +202,7 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
             None,
             {"vox_offset": 800},
             extensions=((6, b"x" * 100),),
-            # not 2**31: nibabel asks for so much memory, though it touches none of it
+            # not 2**31, because nibabel would allocate that much memory, although it touches none of it
             cut=lambda whole: whole[:352] + (2**28).to_bytes(4, "little") + whole[356:],
         ),
         NOT_READABLE,
@@ -217,7 +217,7 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
         ),
         NOT_READABLE,
     ),
-    # where things are
+    # geometry
     "NaN affine": (header(**only_sform(bent(a11=np.nan))), "bad header.*fix the sform or qform"),
     "infinite affine": (header(**only_sform(bent(a03=np.inf))), "bad header"),
     "NaN origin": (header(**only_sform(bent(a23=np.nan))), "bad header"),
@@ -297,4 +297,4 @@ _UNITS = {"sheared axes", "metres without a word", "micrometres without a word"}
 _VALUES = {"one infinite", "beyond float32", "constant", "too faint to divide by", "too bright to square", "a mask"}
 _SHAPES = {"one slice", "one pixel", "slope beyond float32"}
 USABLE_AS_A_VOLUME = _UNITS | _VALUES | _SHAPES | {f"all {what}" for what in ("infinite", "zero", "negative", "NaN")}
-"""Bad as a stack of thick slices; as a volume each command judges for itself."""
+"""Bad as a stack of thick slices; each command decides whether it accepts them as a volume."""

@@ -1,4 +1,4 @@
-"""Commands run inside the test's process, and what a refusal must look like."""
+"""Commands run inside the test's process, and the form that a refusal must have."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from pathlib import Path
 from types import FrameType
 
 MAX_SECONDS = 5.0
-"""Of a processor: the machine may be busy with something else."""
+"""CPU seconds, since the machine may be busy with something else."""
 
 MAX_WAITING_SECONDS = 60.0
-"""For what waits without computing, such as a pipe that nobody writes to."""
+"""Wall time limit for commands that wait without computing, such as on a pipe without a writer."""
 
 MAX_BYTES = 500_000_000
-"""That a refusal may take at most: far under what the files claim."""
+"""Largest memory of a refusal, far below the sizes that the files claim."""
 
 REMEDY = re.compile(r"(?:; |\bexpected )(?:\S+ )?\S*[A-Za-z]{2}")
-"""What to do, or what was expected, in words."""
+"""Words that state a remedy or an expectation."""
 
 Main = Callable[[list[str]], int]
 
 
 class TooSlowError(BaseException):
-    """A command took longer than `MAX_SECONDS`; no handler of the code under test catches it."""
+    """Raised if a command takes longer than `MAX_SECONDS`; the code under test does not catch it."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command did: its exit code, what it printed, seconds, memory it took at most, files that changed."""
+    """Outcome of a command: exit code, output, seconds, peak memory, changed files."""
 
     code: int
     out: str
@@ -47,7 +47,7 @@ class Outcome:
 
 @contextlib.contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Raise `TooSlowError` in the block once it has computed that long, or waited for a minute."""
+    """Raise `TooSlowError` in the block after that much CPU time, or after a minute of waiting."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise TooSlowError(f"longer than {seconds} s")
@@ -66,7 +66,7 @@ def within(seconds: float) -> Iterator[None]:
 
 
 def run(main: Main, arguments: Sequence[object], watched: Path) -> Outcome:
-    """Run a command's `main`; an exception other than the parser's exit goes on."""
+    """Run a command's `main`; exceptions other than the parser's exit are passed on."""
     out, err = io.StringIO(), io.StringIO()
     before, held, start = state(watched), _begin_peak(), time.monotonic()
     tracemalloc.start()
@@ -85,7 +85,7 @@ def run(main: Main, arguments: Sequence[object], watched: Path) -> Outcome:
 
 
 def assert_refused(outcome: Outcome, command: str, names: str, says: str) -> None:
-    """Exit code 3, one line that names what is wrong and says what to do, nothing written, memory bounded."""
+    """Assert a proper refusal: exit code 3, one line with problem and remedy, nothing written, bounded memory."""
     assert outcome.code == 3, outcome
     lines = outcome.err.splitlines()
     assert len(lines) == 1, outcome.err
@@ -99,7 +99,7 @@ def assert_refused(outcome: Outcome, command: str, names: str, says: str) -> Non
 
 
 def state(folder: Path) -> set[tuple[str, object]]:
-    """Everything below a folder: names, and the bytes of ordinary files."""
+    """State of a folder: all names below it, and the bytes of ordinary files."""
     return {
         (str(path), path.read_bytes() if path.is_file() and not path.is_symlink() else path.lstat().st_mode)
         for path in folder.rglob("*")
@@ -107,15 +107,15 @@ def state(folder: Path) -> set[tuple[str, object]]:
 
 
 def has_remedy(line: str) -> bool:
-    """Whether an error says what was expected or what to do, in words: numbers of a shape are no remedy."""
+    """Whether an error states in words what was expected or what to do; the numbers of a shape are not enough."""
     return REMEDY.search(line) is not None
 
 
 def _begin_peak() -> int:
-    """Make the peak of the process's memory begin anew, where the system lets it; returns the peak so far.
+    """Reset the peak memory of the process, if the system allows it; returns the peak so far.
 
-    The peak of a whole life would hide what a command takes after a test that took more. What Python and numpy take
-    is counted by itself, whether they touch it or not: this is for the other libraries.
+    The peak over the whole process would hide the memory of a command after a test that took more. Memory of Python and
+    numpy is counted separately, whether touched or not; this measures the other libraries.
     """
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

@@ -1,4 +1,4 @@
-"""What the fault tests share: networks read once, a small case, runs that are killed."""
+"""Fixtures of the fault tests: networks read once, a small case, runs that are killed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def kept_networks(tmp_path_factory: pytest.TempPathFactory) -> dict[type, Callable[..., object]]:
-    """Loaders that read a file once; a dry run has imported and compiled all that a command needs."""
+    """Loaders that read each file once; a dry run has imported and compiled everything that a command needs."""
     from g3r.cli.infer import main
     from g3r.pose_network.model import PoseModel
     from g3r.prior.model import Prior
@@ -34,7 +34,7 @@ def kept_networks(tmp_path_factory: pytest.TempPathFactory) -> dict[type, Callab
 
 @pytest.fixture
 def networks_once(kept_networks: dict[type, Callable[..., object]], monkeypatch: pytest.MonkeyPatch) -> None:
-    """For commands inside this process: nothing is imported, compiled or read that is the same for all."""
+    """Let commands inside this process reuse what is imported, compiled and read once for all."""
     for kind, loader in kept_networks.items():
         monkeypatch.setattr(kind, "load", loader)
 
@@ -49,7 +49,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
 
 @pytest.fixture(scope="session")
 def killed() -> Iterator[Killed]:
-    """Runs of g3r-infer in processes of their own, to be killed."""
+    """Runs of g3r-infer in separate processes, to be killed."""
     from tests.faults.small_case import fork_server
 
     with fork_server() as run:

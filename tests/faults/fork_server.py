@@ -1,8 +1,8 @@
-"""A process that has imported everything, and runs `g3r-infer` in forks of itself, to be killed.
+"""Fork server: a process that has imported everything and runs `g3r-infer` in forks of itself, to be killed.
 
-Reads a request a line: {"arguments", "kill_after_s" (null: not at all), "signal", "file_bytes"}. Answers
-with {"code" (negative: the signal that ended it), "output", "seconds"}. Nothing is computed in this process
-itself: thread pools do not survive a fork.
+It reads one request per line: {"arguments", "kill_after_s" (null: never), "signal", "file_bytes"}. It answers
+with {"code" (negative: the signal that ended it), "output", "seconds"}. This process itself computes nothing,
+because thread pools do not survive a fork.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def run(request: dict) -> dict:
                 code = g3r.cli.infer.main(request["arguments"])
             except SystemExit as end:
                 code = int(end.code or 0)
-            except KeyboardInterrupt:  # before the command listened
+            except KeyboardInterrupt:  # before the command handled signals
                 code = 130
             finally:
                 sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Runs fuzz cases: in the test's process, or many of them in one of its own with bounded memory.
+"""Runner of fuzz cases: in the test's process, or many cases in a separate process with bounded memory.
 
 python -m tests.faults.fuzz headers 10000 1        # prints a line of JSON with the counts
 """
@@ -20,17 +20,17 @@ from tests.faults.commands import TooSlowError, has_remedy, within
 
 MAX_SECONDS = 5.0
 MAX_GAINED_BYTES = 1_500_000_000
-"""Of address space, beyond what the process holds once everything is imported."""
+"""Limit of address space, beyond that of the process after all imports."""
 
 MAX_TOLD = 20
-"""Failures that are described; all are counted."""
+"""Number of failures that are described; all are counted."""
 
 
 class Fuzz(Protocol):
-    """Cases by number."""
+    """Fuzz cases by number."""
 
     def run(self, number: int) -> None:
-        """One case: returns, or raises `InputError`."""
+        """Run one case: return, or raise `InputError`."""
 
 
 def header_fuzz(folder: Path, seed: int) -> Fuzz:
@@ -74,12 +74,12 @@ def run_cases(kind: str, n_cases: int, seed: int, folder: Path, first: int = 0) 
 
 
 def is_one_line(message: str) -> bool:
-    """A refusal: a name, what was found, what to do; not too long to read."""
+    """Whether a refusal has a name, the finding and a remedy in one readable line."""
     return ": " in message and has_remedy(message) and "\n" not in message and len(message) < 600
 
 
 def main() -> None:
-    """Run the cases that the command line asks for, with a limit on memory."""
+    """Run the cases of the command line with a memory limit."""
     kind, n_cases, seed = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     with tempfile.TemporaryDirectory() as folder:
         run_cases(kind, 20, seed, Path(folder), first=10**6)  # imports and compiles

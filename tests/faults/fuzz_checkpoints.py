@@ -1,7 +1,7 @@
-"""Random damage to the files of both networks. Each case must load whole, or end in one `InputError`.
+"""Random damage to the files of prior and pose network. Each case must load completely or raise one `InputError`.
 
-Damage on five levels: bytes of the file; bytes of its header in front of the right tensors; the header's claims; the
-description and the tensors, with checksums that are right again; programs that would run where they were unpickled.
+The damage has five levels: bytes of the file; bytes of its header before correct tensors; claims of the header;
+description and tensors, with matching checksums; programs that would run if they were unpickled.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ N_LEVELS = 10
 
 
 class Canary:
-    """Makes a folder where it is unpickled."""
+    """An object that makes a folder when it is unpickled."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -69,7 +69,7 @@ class CheckpointFuzz:
 
         Raises:
             InputError: the file was refused.
-            AssertionError: something in it was run, or what was taken is not whole.
+            AssertionError: a program in the file was run, or the loaded network is incomplete.
         """
         rng = np.random.default_rng([self.seed, number])
         which = int(rng.integers(len(KINDS)))
@@ -104,7 +104,7 @@ class CheckpointFuzz:
             path.unlink()
 
     def program(self, rng: np.random.Generator, content: Content, whole: bytes, path: Path) -> None:
-        """A file that makes a folder where anything in it is run."""
+        """A file that makes a folder if anything in it is run."""
         payload = Canary(self.canary)
         pickled = pickle.dumps(payload, protocol=int(rng.integers(6)))
         kind = rng.integers(4)
@@ -112,14 +112,14 @@ class CheckpointFuzz:
             path.write_bytes(pickled)
         elif kind == 1:  # either format of torch.save
             torch.save({**content, "x": payload}, path, _use_new_zipfile_serialization=bool(rng.integers(2)))
-        elif kind == 2:  # in place of the header
+        elif kind == 2:  # instead of the header
             path.write_bytes(with_header(pickled, whole))
-        else:  # behind a length, as the header begins
+        else:  # after a length, like the header
             path.write_bytes(with_header(b"{" + pickled, whole))
 
 
 def damaged_header(rng: np.random.Generator, whole: bytes) -> bytes:
-    """A file with other bytes in its header, of the length that it says or of another."""
+    """A file with changed bytes in its header, with a right or wrong stated length."""
     n_header = int.from_bytes(whole[:8], "little")
     header = bytearray(whole[8 : 8 + n_header])
     if rng.random() < 0.4:
@@ -133,7 +133,7 @@ def damaged_header(rng: np.random.Generator, whole: bytes) -> bytes:
 
 
 def change_claims(rng: np.random.Generator, header: dict[str, Any]) -> None:
-    """Let the header claim something else of a tensor, or of the description."""
+    """Change a claim of the header about a tensor or the description."""
     name = list(header)[rng.integers(len(header))]
     kind = rng.integers(6)
     if kind == 0:
@@ -151,7 +151,7 @@ def change_claims(rng: np.random.Generator, header: dict[str, Any]) -> None:
 
 
 def odd_value(rng: np.random.Generator) -> Any:
-    """Something that an entry should not be, of what JSON can hold."""
+    """An unexpected JSON value for an entry."""
     values: list[Callable[[], Any]] = [
         lambda: None,
         lambda: True,
@@ -185,7 +185,7 @@ def odd_value(rng: np.random.Generator) -> Any:
 
 
 def odd_tensor(rng: np.random.Generator) -> torch.Tensor:
-    """A tensor that is none of the network's."""
+    """A tensor that does not belong to the network."""
     values: list[Callable[[], torch.Tensor]] = [
         lambda: torch.zeros(3),
         lambda: torch.tensor(float("nan")),
@@ -201,7 +201,7 @@ def odd_tensor(rng: np.random.Generator) -> torch.Tensor:
 
 
 def change_content(rng: np.random.Generator, content: Content) -> None:
-    """Replace, remove, rename or add an entry of the description, or a tensor."""
+    """Replace, remove, rename or add an entry of the description or a tensor."""
     if rng.random() < 0.6:
         change_weights(rng, content["weights"])
         return

@@ -1,6 +1,6 @@
-"""Random damage to NIfTI files. Each case must load as a whole stack, or end in one `InputError`.
+"""Random damage to NIfTI files. Each case must load as a complete stack or raise one `InputError`.
 
-`python -m tests.faults.fuzz headers 10000 1` runs them in a process with bounded memory (fuzz.py).
+`python -m tests.faults.fuzz headers 10000 1` runs the cases in a process with bounded memory (fuzz.py).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ NUMBERS = (
     1792,
     2304,
 )
-"""What header fields are set to: ends of their types, codes of data types, what is no number."""
+"""Values for header fields: limits of their types, codes of data types, values that are not numbers."""
 
 FIELDS = (
     "sizeof_hdr",
@@ -112,7 +112,7 @@ class HeaderFuzz:
 
         Raises:
             InputError: the file was refused.
-            AssertionError: it was taken, and what came of it is no stack.
+            AssertionError: the file was accepted but the result is not a valid stack.
         """
         rng = np.random.default_rng([self.seed, number])
         role = ROLES[rng.choice(3, p=(0.6, 0.2, 0.2))]
@@ -142,7 +142,7 @@ class HeaderFuzz:
 
 
 def damaged_nifti(rng: np.random.Generator, is_mask: bool) -> bytes:
-    """A file with up to four header fields, or entries of them, set to numbers that mean something."""
+    """A file with up to four header fields, or entries of them, set to meaningful numbers."""
     data = ball(SHAPE) if is_mask else image(int(rng.integers(9)), SHAPE)
     if rng.random() < 0.2:
         data = data.astype(rng.choice(["<i2", "<u2", "<f8", "<i4", "<u1"]))
@@ -166,7 +166,7 @@ def damaged_nifti(rng: np.random.Generator, is_mask: bool) -> bytes:
 
 
 def damaged_bytes(rng: np.random.Generator, content: bytearray, reach: int) -> bytearray:
-    """Bytes overwritten, turned, cut off, taken out or put in, near the beginning."""
+    """Bytes overwritten, inverted, truncated, removed or inserted near the beginning."""
     kind, n = rng.integers(5), len(content)
     at = int(rng.integers(max(min(reach, n), 1)))
     few = int(rng.integers(1, 17))
@@ -184,7 +184,7 @@ def damaged_bytes(rng: np.random.Generator, content: bytearray, reach: int) -> b
 
 
 def check_stack(stack: Stack) -> None:
-    """What was taken must be whole: finite values, a proper grid, slices."""
+    """Assert that an accepted stack is valid: finite values, a proper grid, slices."""
     assert stack.image.dtype == np.float32
     assert stack.image.ndim == 3
     assert stack.image.size <= 10_000, "more voxels than any of these files holds"
@@ -207,7 +207,7 @@ def _layout(version: int) -> np.dtype:
 
 
 def _fitting(number: float, dtype: np.dtype) -> float:
-    """A number as a field can hold it: whole ones wrap around."""
+    """A number converted to the field's type; integers wrap around."""
     if dtype.kind == "f":
         return float(number)
     whole = int(number) if np.isfinite(number) else -1

@@ -1,4 +1,4 @@
-"""Small NIfTI files, good ones and ones whose headers say anything at all."""
+"""Small NIfTI files: good ones, and ones with arbitrary headers."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def image(seed: int = 0, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
 
 
 def ball(shape: tuple[int, ...] = SHAPE) -> np.ndarray:
-    """A mask that leaves a rim, uint8."""
+    """A ball-shaped mask with a margin to the border, uint8."""
     index = np.stack(np.meshgrid(*[np.linspace(-1, 1, n) for n in shape[:3]], indexing="ij"), -1)
     return ((index**2).sum(-1) < 0.8).astype(np.uint8)
 
 
 def write(path: Path, data: np.ndarray | None = None, affine: np.ndarray | None = None) -> Path:
-    """A plain good file."""
+    """Write a good file."""
     nib.save(nib.Nifti1Image(image() if data is None else data, AFFINE if affine is None else affine), path)
     return path
 
@@ -39,7 +39,7 @@ def raw(
     version: int = 1,
     extensions: tuple[tuple[int, bytes], ...] = (),
 ) -> bytes:
-    """The bytes of an uncompressed file with header fields set to anything, without a check."""
+    """The bytes of an uncompressed file with header fields set to arbitrary values, unchecked."""
     kind = nib.Nifti1Image if version == 1 else nib.Nifti2Image
     given = image() if data is None else data
     made = kind(given, AFFINE if affine is None else affine, dtype=given.dtype)
@@ -55,7 +55,7 @@ def raw(
 
 
 def write_raw(path: Path, *arguments: Any, cut: Callable[[bytes], bytes] = bytes, **options: Any) -> Path:
-    """`raw` as a file, compressed where its name says so; `cut` damages the bytes before that."""
+    """Write `raw` as a file, compressed if its name says so; `cut` damages the bytes before compression."""
     content = cut(raw(*arguments, **options))
     path.write_bytes(gzip.compress(content, 1) if path.name.lower().endswith(".gz") else content)
     return path

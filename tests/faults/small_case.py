@@ -1,4 +1,4 @@
-"""A case that is reconstructed in about a second, as a command and in processes that are killed."""
+"""A case that is reconstructed in about a second, as a command or in processes that are killed."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ WHOLE = {
 """Files of a result without a prior network."""
 
 BY_COMMAND = {"log.txt"}
-"""Those that the command adds to what a result writes by itself."""
+"""Files that the command adds to those of a saved result."""
 
 
 @dataclass(frozen=True)
 class SmallCase:
-    """Three small stacks, settings for a quick run in a run.json, and the volume that they give."""
+    """Three small stacks, a run.json with settings for a quick run, and the resulting volume."""
 
     folder: Path
     config: Path
     volume: bytes
 
     def arguments(self, output: Path, *further: str) -> list[str]:
-        """Of g3r-infer, for the quick run."""
+        """Arguments of g3r-infer for the quick run."""
         return [
             "--stacks",
             *self.files("stack"),
@@ -68,16 +68,16 @@ class SmallCase:
         ]
 
     def files(self, kind: str) -> list[str]:
-        """Of stacks or masks."""
+        """Files of the stacks or masks."""
         return [str(self.folder / f"{kind}-{n}.nii.gz") for n in range(3)]
 
     def run(self, output: Path, *further: str) -> int:
-        """The quick run in this process; its exit code."""
+        """Run the quick run in this process; returns its exit code."""
         return infer(self.arguments(output, *further))
 
 
 def quick_settings() -> ReconstructionSettings:
-    """Settings of a run of about a second."""
+    """Settings for a run of about a second."""
     registration = replace(
         QUICK_FIT.registration,
         template=False,
@@ -86,12 +86,12 @@ def quick_settings() -> ReconstructionSettings:
         segments=False,
         n_rounds=1,
         standard_orientation=False,
-    )  # a fraction of a second; the poses do not matter here
+    )  # the poses do not matter here, so registration is a fraction of a second
     return replace(QUICK_FIT, registration=registration, resolution_mm=2.0, use_prior=False)
 
 
 def make_small_case(folder: Path) -> SmallCase:
-    """Simulate the stacks, write a run.json of the quick settings, and run it for its volume."""
+    """Simulate the stacks, write a run.json with the quick settings, and run once to get the volume."""
     simulate_small_subject(folder / "stacks", "--seed", "61001")
     case = SmallCase(folder / "stacks", folder / "run.json", b"")
     stacks, masks = (tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask"))
@@ -107,7 +107,7 @@ def make_small_case(folder: Path) -> SmallCase:
 
 
 def names(folder: Path) -> set[str]:
-    """What lies in a folder."""
+    """Names of the entries of a folder."""
     return {path.name for path in folder.iterdir()}
 
 
@@ -116,7 +116,7 @@ Killed = Callable[..., dict[str, Any]]
 
 @contextmanager
 def fork_server() -> Iterator[Killed]:
-    """Runs of g3r-infer in processes that begin at once: call with arguments and kill_after_s, signal."""
+    """Start a fork server; returns a function that runs g3r-infer with arguments, kill_after_s and signal."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join([str(FOLDER.parents[1]), os.environ.get("PYTHONPATH", "")])
     with subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Files that are no networks: refused by the command in one line, and nothing in them is run."""
+"""Files that are not networks: refused by the command in one line, and nothing in them is run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Maker = Callable[[Path], object]
 
 
 def changed(**entries: Any) -> Maker:
-    """A good prior with other entries."""
+    """A good prior with changed entries."""
 
     def make(path: Path) -> None:
         small_prior().save(path)
@@ -48,7 +48,7 @@ def changed(**entries: Any) -> Maker:
 
 
 def claims(**entries: Any) -> Maker:
-    """A good prior of which the header claims other things about a tensor."""
+    """A good prior whose header makes other claims about a tensor."""
 
     def make(path: Path) -> None:
         small_prior().save(path)
@@ -59,7 +59,7 @@ def claims(**entries: Any) -> Maker:
 
 
 def zeros_unfold(path: Path) -> None:
-    """A small archive with an entry that unfolds to 64 MB."""
+    """A small archive with an entry that decompresses to 64 MB."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("prior/data.pkl", "w") as entry:
         for _ in range(64):
             entry.write(bytes(2**20))
@@ -165,7 +165,7 @@ def test_a_program_is_not_run(way: str, tmp_path: Path, tally: Tally) -> None:
 
 
 def test_the_canary_sings(tmp_path: Path) -> None:
-    """Unpickled without care, the files above do run their program: the tests would see it."""
+    """Unsafe unpickling of the files above does run their program, so the tests would detect it."""
     canary, path = Canary(tmp_path / "ran"), tmp_path / "bad.pt"
     WAYS["archive"](path, canary)
     torch.load(path, weights_only=False)

@@ -1,4 +1,4 @@
-"""Stacks, masks, folders and options that `g3r-infer` must refuse, each in its way."""
+"""Stacks, masks, folders and options that `g3r-infer` must refuse, each with its own message."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def stack(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", BAD_STACKS)
 def test_a_bad_stack(name: str, stack: Path, tmp_path: Path, tally: Tally) -> None:
-    """Alone, and as the second of two: the other one is not blamed."""
+    """Alone, and as the second of two, where the message must not name the other one."""
     make, says = BAD_STACKS[name]
     (tmp_path / "bad files").mkdir()
     bad = make(tmp_path / "bad files")
     named = bad.name.replace("\0", "\\x00")
-    # where one stack has no usable slice the others go on, with a warning (tests/pipeline)
+    # if one stack has no usable slice, the others are used, with a warning (tests/pipeline)
     for stacks in [[bad]] if name == "one pixel" else [[bad], [stack, bad]]:
         with tally.case() as case:
             outcome = run(main, ["--stacks", *stacks, "--whole-image", "--output", tmp_path / "out"], tmp_path)
@@ -54,7 +54,7 @@ def test_a_bad_mask(name: str, stack: Path, tmp_path: Path, tally: Tally) -> Non
 
 
 def pairs(folder: Path) -> dict[str, tuple[list[Path], str, str]]:
-    """Stacks that are each good but not together: files, the one to be named, what is said."""
+    """Stacks that are good alone but not together: files, the file to be named, the message."""
     first = folder / "stack.nii.gz"
     (folder / "link.nii.gz").symlink_to(first)
     (folder / "copy.nii.gz").write_bytes(first.read_bytes())
@@ -164,7 +164,7 @@ def test_force_takes_no_folder_for_a_result_that_holds_none(stack: Path, tmp_pat
 
 @pytest.mark.parametrize("role", ["stack", "mask", "link"])
 def test_an_input_is_never_in_the_way_of_an_output(role: str, tmp_path: Path, tally: Tally) -> None:
-    """With --force a folder may be replaced, but not what is read from it."""
+    """With --force a folder may be replaced, but not if input is read from it."""
     stack = write(tmp_path / ("volume.nii.gz" if role == "stack" else "stack.nii.gz"))
     mask = write(tmp_path / ("mask.nii.gz" if role == "mask" else "brain.nii.gz"), ball())
     folder = tmp_path
@@ -247,7 +247,7 @@ USAGE = [
 
 @pytest.mark.parametrize("words", USAGE, ids=" ".join)
 def test_wrong_usage(words: list[str], tmp_path: Path, tally: Tally) -> None:
-    """Options are judged before files: those named here do not exist."""
+    """Options are checked before files, which do not exist here."""
     two = ["--stacks", "a.nii", "b.nii", "--output", "out"]
     whole = words if not words or words[0] in ("--output", "--stacks") else [*two, *words]
     if words and words[0] == "--thickness" and len(words) == 3:

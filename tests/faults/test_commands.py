@@ -1,4 +1,4 @@
-"""What the fault tests measure a command by: its memory whatever came before, and words that help."""
+"""Measures of the fault tests: memory of a command independent of earlier ones, and words of a remedy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINE = "g3r-x: bad.nii: has shape (24, 20); expected 3D, split the frames"
 
 
 def refusal(arguments: list[str]) -> int:
-    """A command that takes the memory that a header claims before it refuses the file."""
+    """A command that allocates the memory claimed by a header before it refuses the file."""
     if "numpy" in arguments:
         np.empty(CLAIMED, np.uint8)  # not touched
     if "torch" in arguments:

@@ -1,4 +1,4 @@
-"""A full disk, a quota, a limit on files: one line that says so, nothing half written, and a way on."""
+"""A full disk, a quota, a limit on file size: one line of error, nothing half written, and a way to continue."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZES = ("16k", "200k", "600k", "1000k", "1400k", "2000k", "4m", ENOUGH)
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """An empty folder where a small disk can be mounted; skips where this user may not."""
+    """An empty folder where a small disk can be mounted; skips if this user may not mount."""
     place = tmp_path / "disk"
     place.mkdir()
     if shutil.which("mount") is None or not mounted(place, ENOUGH):
@@ -66,7 +66,7 @@ def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
                 assert "MB are free" in line
                 assert names(small_disk) <= {"out.unfinished"}
                 assert not (small_disk / "out.unfinished" / "new").exists()
-                # somebody makes room
+                # the user frees space
                 remount = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
                 subprocess.run(remount, check=True, capture_output=True)
                 assert killed(case.arguments(out, "--resume"))["code"] == 0
@@ -79,7 +79,7 @@ def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
 
 @pytest.mark.faults
 def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally) -> None:
-    for file_bytes in (2_000, 20_000, 60_000, 100_000, 300_000):  # what the command says goes to a file, too
+    for file_bytes in (2_000, 20_000, 60_000, 100_000, 300_000):  # the command's output also goes to a file
         with tally.case() as one:
             ended = killed(case.arguments(tmp_path / "out"), file_bytes=file_bytes)
             assert ended["code"] == 3, ended
@@ -91,7 +91,7 @@ def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path:
 def test_a_write_that_fails_leaves_the_earlier_result(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
 ) -> None:
-    """As on a disk that is full when the last file is written."""
+    """The last file cannot be written, as on a full disk."""
     out = tmp_path / "out"
     out.mkdir()
     for name in ("volume.nii.gz", "run.json"):
@@ -140,7 +140,7 @@ def test_stages_give_way_where_only_that_makes_room(
         free = shutil.disk_usage(tmp_path)
         monkeypatch.setattr("shutil.disk_usage", lambda path: free._replace(free=500))
         run.make_room(400)
-        run.make_room(2000)  # would not be enough all the same
+        run.make_room(2000)  # would still not be enough
         assert run.stages.exists()
         run.make_room(1400)
         assert not run.stages.exists()
@@ -160,7 +160,7 @@ def test_what_is_said_of_a_file_that_could_not_be_written(tmp_path: Path, number
 
 @pytest.mark.faults
 def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally: Tally) -> None:
-    """ulimit -v, from far too little to enough."""
+    """Limits by ulimit -v, from far too little to enough."""
     codes = []
     for megabytes in (120, 200, 300, 450, 600, 800, 1000, 1100, 1200, 3000):
         with tally.case() as one:
@@ -177,7 +177,7 @@ def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally:
             if done.returncode:
                 if done.returncode == 4:
                     assert last_line(done.stderr).startswith("g3r-infer: out of memory; choose")
-                else:  # OpenBLAS or C++ in their own words, where they start or take a thread
+                else:  # messages of OpenBLAS or C++, when they start or begin a thread
                     assert done.returncode in (1, -signal.SIGABRT), done.stderr
                     assert "Traceback" not in done.stderr
                 assert names(tmp_path) <= {"out.unfinished"}
@@ -230,7 +230,7 @@ def test_the_working_folder_takes_a_result(tmp_path: Path, monkeypatch: pytest.M
 def test_a_run_killed_while_files_move_onto_a_mount_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally, moved: int
 ) -> None:
-    """Whatever was moved: afterwards the earlier result is there, or the new one, and nothing of the other."""
+    """However many files were moved, afterwards either the earlier or the new result is there, complete and alone."""
     from g3r.run.output_folder import OutputFolder
 
     monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
@@ -254,11 +254,11 @@ def test_a_run_killed_while_files_move_onto_a_mount_point(
             for name in result:
                 (staged / name).write_text("new")
             patch.setattr("os.rename", killed)
-            patch.setattr(folder, "_clean", lambda: None)  # a dead process cleans nothing
+            patch.setattr(folder, "_clean", lambda: None)  # a killed process does not clean up
         assert len(done) == moved
-        folder._clean()  # the next one does
+        folder._clean()  # the next process does
         assert names(out) - {".unfinished"} == result | {"notes"}
-        whole = moved == 8  # three files out, the backup named, three in, the backup named anew
+        whole = moved == 8  # three files out, the backup renamed, three in, the backup renamed again
         assert {(out / name).read_text() for name in result} == {"new" if whole else "old"}
         assert (out / "notes").read_text() == "old"
 
@@ -266,7 +266,7 @@ def test_a_run_killed_while_files_move_onto_a_mount_point(
 def test_a_mount_point_takes_a_result_without_a_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally
 ) -> None:
-    """Series of DICOM, exported poses and simulations hold no run.json, and some hold folders."""
+    """DICOM series, exported poses and simulations have no run.json, and some have folders."""
     from g3r.run.output_folder import OutputFolder
 
     monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)

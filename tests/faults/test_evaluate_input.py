@@ -1,4 +1,4 @@
-"""`g3r-evaluate` with bad files: a line, never a traceback."""
+"""`g3r-evaluate` with bad files: one line of error, never a traceback."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.tally import Tally
 
 
 def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) -> bool:
-    """Whether a command refused; asserts that it did so properly, or else went through."""
+    """Whether a command refused its input; asserts that a refusal is proper, and required if `must`."""
     if must or outcome.code:
         assert_refused(outcome, command, bad.name.replace("\0", "\\x00") if must else "", says if must else "")
         return True
@@ -24,15 +24,15 @@ def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) 
 
 
 VALID_MASKS = {"constant", "a mask", "all infinite", "slope beyond float32"}
-"""Of the files that are no stack: all or a part of their voxels have one value above a half."""
+"""Invalid stacks that are valid masks, because all or some of their voxels have one value above a half."""
 
 NO_MASK = "mask is empty; expected|as an image does; expected|; resample the mask"
-"""What is said of images that can be read; of the others it is what is said of a stack."""
+"""Message for readable images that are not masks; for the others it is the message for a stack."""
 
 
 @pytest.mark.parametrize("name", BAD_STACKS)
 @pytest.mark.parametrize("role", ["volume", "reference", "mask"])
-def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally) -> None:
+def test_evaluate_refuses_a_bad_file_or_gives_finite_scores(role: str, name: str, tmp_path: Path, tally: Tally) -> None:
     make, says = BAD_STACKS[name]
     files = {"volume": write(tmp_path / "v.nii"), "reference": write(tmp_path / "r.nii", image(1))}
     files["mask"] = write(tmp_path / "m.nii", ball())

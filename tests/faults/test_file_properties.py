@@ -1,4 +1,4 @@
-"""Any grid: `Stack` to file to `Stack`. Any header: `g3r-infer --dry-run` ends with 0 or a line."""
+"""Properties for any grid (a stack survives its file) and any header (a dry run succeeds or ends in one line)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.faults.nifti_files import ball, image, write, write_raw
 from tests.tally import Tally
 
 FIELD_EPSILON = float(np.finfo(np.float32).eps)
-"""NIfTI-1 keeps affines as float32."""
+"""Relative precision of affines, which NIfTI-1 stores as float32."""
 
 quick = settings(
     deadline=None,
@@ -36,7 +36,7 @@ quick = settings(
 
 @st.composite
 def stacks(draw: st.DrawFn) -> Stack:
-    """Any stack: oblique, left-handed, slices of any thickness and distance, far from the origin."""
+    """Any stack: oblique, left-handed, with any slice thickness and spacing, far from the origin."""
     shape = draw(st.tuples(st.integers(4, 12), st.integers(4, 12), st.integers(2, 6)))
     turn = Rotation.from_rotvec(draw(st.tuples(*[st.floats(-3.1, 3.1)] * 3))).as_matrix()
     in_plane = draw(st.tuples(st.floats(0.3, 2.0), st.floats(0.3, 2.0)))
@@ -48,14 +48,14 @@ def stacks(draw: st.DrawFn) -> Stack:
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     scale = 10.0 ** draw(st.integers(-6, 6))
     data = (rng.normal(size=shape) * scale + draw(st.floats(0, 3)) * scale).astype(np.float32)
-    data.flat[0] = scale  # something positive
+    data.flat[0] = scale  # at least one positive value
     mask = rng.random(shape) < draw(st.floats(0.2, 1.0))
     mask.flat[:2] = True
     return Stack(image=data, mask=mask, affine=affine, thickness_mm=draw(st.floats(0.1, 20.0)), name="any")
 
 
 def written_and_read(stack: Stack, folder: Path, order: tuple[int, ...], ending: str) -> Stack:
-    """A stack as a file whose axes are in another order, read again."""
+    """A stack after writing to a file with another order of axes, and reading."""
     affine = stack.affine.copy()
     affine[:3, :3] = affine[:3, order]
     save_volume(folder / f"image{ending}", stack.image.transpose(order), affine)
@@ -66,7 +66,7 @@ def written_and_read(stack: Stack, folder: Path, order: tuple[int, ...], ending:
 @given(stacks(), st.permutations(range(3)), st.sampled_from([".nii", ".nii.gz"]))
 @settings(quick, max_examples=100)
 def test_a_stack_survives_its_file(tally: Tally, stack: Stack, order: list[int], ending: str) -> None:
-    """Values and masks to the bit, positions to the rounding of float32, whichever axis the slices are on."""
+    """Values and masks are bit-identical, positions agree to float32 rounding, for any slice axis."""
     with tally.case(), TemporaryDirectory() as folder:
         back = written_and_read(stack, Path(folder), tuple(order), ending)
         np.testing.assert_array_equal(back.axes.to_file(back.image), stack.image.transpose(order))
@@ -76,7 +76,7 @@ def test_a_stack_survives_its_file(tally: Tally, stack: Stack, order: list[int],
         turned = back.axes.grid_from_file(in_file)
         moved = np.linalg.norm(back.grid.world(turned.corner_index) - turned.world(turned.corner_index), axis=1)
         reach_mm = np.linalg.norm(turned.world(turned.corner_index) - turned.center_mm, axis=1)
-        assert (moved < 0.01 + 2e-4 * reach_mm).all()  # read to so much (`settled`)
+        assert (moved < 0.01 + 2e-4 * reach_mm).all()  # the precision of reading (`settled`)
         corner = np.array(stack.image.shape) - 1
         for index in (np.zeros(3), corner, corner / 2):
             reach = np.abs(stack.affine[:3, :3]) @ corner + np.abs(stack.affine[:3, 3])
@@ -87,7 +87,7 @@ def test_a_stack_survives_its_file(tally: Tally, stack: Stack, order: list[int],
 @given(stacks(), st.sampled_from(["<i2", "<u2", "<u1"]))
 @settings(quick, max_examples=50)
 def test_whole_numbers_with_a_scaling_are_right_to_rounding(tally: Tally, stack: Stack, dtype: str) -> None:
-    """As scanners store them: within half a step of the slope that nibabel chooses."""
+    """Integers as stored by scanners are right within half a step of the slope that nibabel chooses."""
     with tally.case(), TemporaryDirectory() as folder:
         path = Path(folder) / "image.nii.gz"
         written = nib.Nifti1Image(stack.image, stack.affine)
@@ -111,7 +111,7 @@ headers = st.dictionaries(
 
 
 def fitted(fields: dict[str, list[float]]) -> dict[str, Any]:
-    """Numbers as the header's fields can hold them."""
+    """Numbers converted to the types of the header's fields."""
     block = np.zeros((), nib.Nifti1Header.template_dtype)
     made = {}
     for name, values in fields.items():
@@ -146,7 +146,7 @@ def dry_run(fields: dict[str, list[float]], ending: str, role: str, tally: Tally
 
 @pytest.mark.usefixtures("networks_once")
 @given(headers, st.sampled_from([".nii", ".nii.gz"]), st.sampled_from(["stack", "mask"]))
-@example({"srow_y": [100.0, 1e-30]}, ".nii.gz", "stack")  # axes that rounding makes singular
+@example({"srow_y": [100.0, 1e-30]}, ".nii.gz", "stack")  # axes that become singular by rounding
 @settings(quick, max_examples=150)
 def test_a_dry_run_of_any_header(tally: Tally, fields: dict[str, list[float]], ending: str, role: str) -> None:
     dry_run(fields, ending, role, tally)

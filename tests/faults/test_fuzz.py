@@ -1,4 +1,4 @@
-"""Damaged NIfTI files and checkpoints by the thousand: a valid load or an `InputError`, and nothing else."""
+"""Thousands of damaged NIfTI files and checkpoints: each loads correctly or raises `InputError`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_few_hundred_cases(kind: str, tmp_path: Path, tally: Tally) -> None:
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", KINDS)
 def test_ten_thousand_cases_with_bounded_memory(kind: str, tally: Tally) -> None:
-    """In a process of its own: a crash of the interpreter, a hang or a lack of memory would end it."""
+    """The cases run in a separate process, which a crash of the interpreter, a hang or lack of memory would end."""
     line = [sys.executable, "-m", "tests.faults.fuzz", kind, str(MANY), str(SEED + 1)]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=400, cwd=Path(__file__).parents[2])
     if done.returncode:

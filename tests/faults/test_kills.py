@@ -1,4 +1,4 @@
-"""kill -9, SIGTERM and Ctrl-C at random moments: the result is whole, or what is there says what it is."""
+"""kill -9, SIGTERM and Ctrl-C at random moments: the result is complete, absent, or marked as partial."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def is_whole(folder: Path, case: SmallCase) -> bool:
 
 
 def moments(n: int, killed: Killed, case: SmallCase, folder: Path, seed: int) -> list[float]:
-    """Random moments in a run, evenly; those of its last fifth, when files are written, twice as many."""
+    """Random moments of a run, twice as dense in its last fifth, when files are written."""
     whole = min(killed(case.arguments(folder / f"timed-{k}"))["seconds"] for k in range(2))
     shutil.rmtree(folder / "timed-0")
     shutil.rmtree(folder / "timed-1")
@@ -102,10 +102,10 @@ def test_a_signal_at_any_moment_gives_nothing_a_marked_volume_or_the_whole(
 
 
 def check_interrupted(ended: dict[str, Any], out: Path, case: SmallCase, code: int) -> None:
-    """What a first signal may leave: see the name of the test."""
+    """Assert the state after a first signal, as named by the test."""
     assert "Traceback" not in ended["output"], ended
     if ended["code"] in (0, -signal.SIGTERM) or (ended["code"] == 130 and "interrupted" not in ended["output"]):
-        # before it listened (the command had just begun), or after all was done
+        # before the command handled signals (it had just begun), or after everything was done
         assert not out.exists() or is_whole(out, case)
         return
     assert ended["code"] == code, ended

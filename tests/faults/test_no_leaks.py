@@ -1,4 +1,4 @@
-"""What headers say in words, and the folders that files lie in, stay out of the results unless asked for."""
+"""Texts of headers and names of folders do not appear in results unless requested."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.faults.nifti_files import AFFINE, ball, image, write_raw
 from tests.tally import Tally
 
 CANARY = "DOE^JANE 1987"
-"""As short as the shortest text field, so that each can hold it whole."""
+"""Word as short as the shortest text field, so that every field can hold it."""
 
 WORDS = {
     "descrip": b"of DOE^JANE 1987 on 2026-11-21",
@@ -39,13 +39,13 @@ EXTENSIONS = ((6, b"DOE^JANE 1987"), (2, b"\0\1DOE^JANE 1987\xff"), (4, b"<DOE^J
 
 
 def planted(path: Path, data: np.ndarray) -> Path:
-    """A file that names a patient in every field that holds text."""
+    """A file with a patient's name in every text field."""
     return write_raw(path, data, WORDS, extensions=EXTENSIONS)
 
 
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two stacks of something like a head, in a folder of the patient's name."""
+    """Two stacks of a head-like object, in a folder with the patient's name."""
     folder = tmp_path_factory.mktemp("data") / CANARY
     folder.mkdir()
     for n in range(2):
@@ -77,7 +77,7 @@ def line(subject: Path, output: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def result(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ReconstructionResult]:
-    """The folder that the command wrote, and what it wrote there."""
+    """The output folder of the command, and its terminal output."""
     kept: list[ReconstructionResult] = []
     work = GaussianReconstructor.reconstruct
 
@@ -93,11 +93,11 @@ def result(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 
 
 BASE64 = re.compile(rb"[A-Za-z0-9+/]{200,}={0,2}")
-"""Letters that stand for bytes, which spell short words by chance; the bytes count."""
+"""Base64 text, which contains short words by chance; only the decoded bytes are searched."""
 
 
 def texts_of(folder: Path) -> dict[str, bytes]:
-    """Everything that was written, unpacked."""
+    """All written files, uncompressed."""
     found = {}
     for path in folder.iterdir():
         found[path.name] = path.read_bytes()
@@ -114,14 +114,14 @@ def texts_of(folder: Path) -> dict[str, bytes]:
 
 
 def traces(folder: Path) -> list[str]:
-    """Files below a folder that hold a part of the canary or of a path."""
+    """Files below a folder that contain a part of the canary or of a path."""
     folders = [str(folder.parent.parent).encode(), b"/tmp", b"pytest-of"]
     words = [b"DOE^", b"JANE", b"2026-11-21", *folders]
     return [name for name, content in texts_of(folder).items() if any(word in content for word in words)]
 
 
 def test_the_inputs_do_hold_the_name(subject: Path) -> None:
-    """The test can fail: what is looked for is in every field of the stacks."""
+    """The search can succeed: the name is in every text field of the stacks."""
     content = gzip.decompress((subject / "stack-0.nii.gz").read_bytes())
     assert content.count(CANARY.encode()) == len(WORDS) - 1 + len(EXTENSIONS)
     assert set(traces(subject)) >= {"stack-0.nii.gz unpacked", "mask-1.nii.gz unpacked"}

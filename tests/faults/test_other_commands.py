@@ -1,4 +1,4 @@
-"""`g3r-simulate`, `g3r-export`, `g3r-bench` with bad files, and all as processes: never a traceback."""
+"""`g3r-simulate`, `g3r-export`, `g3r-bench` with bad files, and all commands as processes: never a traceback."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.tally import Tally
 
 @pytest.fixture(autouse=True, scope="module")
 def everything_is_imported() -> None:
-    """What a command imports when it first needs it takes seconds, and is not what is measured here."""
+    """Import lazily loaded modules first, because that takes seconds which these tests must not measure."""
     for module in ("data_synth.export", "data_synth.phantom", "data_synth.simulator", "g3r.pose_network.network"):
         import_module(module)
     import_module("g3r.prior.dgpn")
 
 
 @pytest.mark.parametrize("name", BAD_STACKS)
-def test_simulate(name: str, tmp_path: Path, tally: Tally) -> None:
+def test_simulate_refuses_a_bad_volume_in_one_line(name: str, tmp_path: Path, tally: Tally) -> None:
     if name in USABLE_AS_A_VOLUME:
         pytest.skip("usable as a volume, and slicing it takes seconds")
     make, says = BAD_STACKS[name]
@@ -100,7 +100,7 @@ RUNS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_export(name: str, tmp_path: Path, tally: Tally) -> None:
+def test_export_refuses_a_bad_checkpoint_in_one_line(name: str, tmp_path: Path, tally: Tally) -> None:
     path, content = tmp_path / "last.ckpt", RUNS[name]
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -139,7 +139,7 @@ REAL = {
 @pytest.mark.faults
 @pytest.mark.parametrize("command", REAL)
 def test_as_a_process(command: str, tmp_path: Path, tally: Tally) -> None:
-    """The exit code that a shell sees, and no more than five seconds of a processor."""
+    """The exit code as seen by a shell, within five CPU seconds."""
     write(tmp_path / "good.nii")
     (tmp_path / "bad.nii.gz").write_bytes(b"no image\n")
     words, code = REAL[command]

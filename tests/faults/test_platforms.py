@@ -1,4 +1,4 @@
-"""Systems other than Linux: modules and functions that they lack are hidden, and a small subject reconstructed."""
+"""Systems other than Linux: a small reconstruction without the modules and functions that they lack."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ for name in ("sched_getaffinity", "sysconf"):
     delattr(os, name)
 """,
 }
-"""What each system lacks of what the code could use."""
+"""Code that hides the modules and functions that each system lacks."""
 
 
 @pytest.mark.parametrize("system", HIDE)
@@ -34,7 +34,7 @@ def test_a_small_subject_without_what_only_linux_has(
 ) -> None:
     with tally.case():
         out = tmp_path / "out"
-        # without --threads and without /proc, as far as it can be hidden
+        # without --threads, and without /proc as far as it can be hidden
         arguments = [one for one in case.arguments(out) if one != "--quiet"]
         code = (
             f"{HIDE[system]}\nimport pathlib\nfrom g3r.run import machine\n"

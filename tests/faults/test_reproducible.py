@@ -1,4 +1,4 @@
-"""Same seed, machine and threads: the same bytes; run.json is enough to run again."""
+"""Same seed, machine and threads give the same bytes, and run.json is enough to repeat a run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_the_same_bytes_again_and_in_another_process(case: SmallCase, tmp_path: 
 def test_options_then_config_then_config_of_that(
     case: SmallCase, tmp_path: Path, tally: Tally, threads: str, further: tuple[str, ...]
 ) -> None:
-    """With all of registration, with and without the prior network, each in a process of its own."""
+    """With the whole registration, with and without the prior network, each run in its own process."""
     if int(threads) > int(numba.config.NUMBA_NUM_THREADS):  # type: ignore[attr-defined]
         pytest.skip("a machine of one core")
     files = ["--stacks", *case.files("stack"), "--masks", *case.files("mask"), "--quiet"]
@@ -66,7 +66,7 @@ def test_options_then_config_then_config_of_that(
 def test_a_run_with_a_time_budget_can_be_run_again_without_its_clock(
     case: SmallCase, tmp_path: Path, tally: Tally, seconds: float
 ) -> None:
-    """The loops stop where they stopped then: run.json has the fractions of all their steps."""
+    """The loops stop at the same steps, whose fractions are recorded in run.json."""
     files = ["--stacks", *case.files("stack"), "--masks", *case.files("mask"), "--quiet", "--threads", "1"]
     options = ["--no-prior", "--resolution", "2", "--thickness", "4", "--time-budget", str(seconds)]
     with tally.case():
@@ -131,7 +131,7 @@ def test_options_that_the_config_decides_are_refused(
 
 
 def spoilt(text: str) -> dict[str, str]:
-    """Contents that are no run.json, by what is wrong."""
+    """Contents that are not a valid run.json, by their fault."""
     record = json.loads(text)
     other = {**record, "settings": {**record["settings"], "surprise": 1}}
     wrong = {**record, "settings": {**record["settings"], "seed": "five"}}

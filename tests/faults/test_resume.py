@@ -1,4 +1,4 @@
-"""--resume: the same bytes from whatever stages there are, and only from stages of the same run."""
+"""--resume: the same bytes from any set of kept stages, and only from stages of the same run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STAGES = tuple(name.replace(" ", "-") for name in NAMES)
 
 @pytest.fixture(scope="module")
 def kept(case: SmallCase, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The stages of a whole run, which ends without writing its result."""
+    """The stages of a complete run that ends without writing its result."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("g3r.output.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError))
@@ -89,7 +89,7 @@ def test_stages_of_another_run_are_refused_by_name(
         arguments = SmallCase(case.folder, tmp_path / "other.json", b"")
         assert arguments.run(tmp_path / "out", "--resume") == 3
         assert f"the earlier run differs in setting {key}; " in capsys.readouterr().err
-        assert len(list((tmp_path / "out.unfinished" / "stages").glob("*.npz"))) == n_stages  # nothing is lost
+        assert len(list((tmp_path / "out.unfinished" / "stages").glob("*.npz"))) == n_stages  # no stage is lost
         one.refused()
 
 
@@ -136,14 +136,14 @@ def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tal
 
 def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, tally: Tally) -> None:
     out, unfinished = tmp_path / "out", tmp_path / "out.unfinished"
-    with tally.case():  # killed between two renames: the earlier result comes back
+    with tally.case():  # killed between two renames: the earlier result is restored
         (unfinished / "backup").mkdir(parents=True)
         (unfinished / "new").mkdir()
         (unfinished / "backup" / "volume").write_text("old")
         with OutputFolder(out, ["volume"]):
             assert (out / "volume").read_text() == "old"
         assert names(tmp_path) == {"out"}
-    with tally.case():  # killed after them: what is not of a result is brought over
+    with tally.case():  # killed after them: files that are not part of a result are moved over
         (unfinished / "backup").mkdir(parents=True)
         (unfinished / "backup" / "volume").write_text("older")
         (unfinished / "backup" / "notes").write_text("mine")

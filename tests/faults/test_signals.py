@@ -1,4 +1,4 @@
-"""Ctrl-C at chosen moments: what is kept, how it is marked, and that a second one ends at once."""
+"""Ctrl-C at chosen moments: kept results and their marks; a second Ctrl-C ends the run at once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ N_STEPS = QUICK_FIT.slice_stage.n_steps
 
 @pytest.fixture
 def interrupt_at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Sends a signal when a stage has reached a step, as often as is said."""
+    """Send a signal a given number of times when a stage reaches a step."""
 
     def choose(stage: str, step: int, number: signal.Signals = signal.SIGINT, times: int = 1) -> None:
         def progress(self: Terminal, name: str, done: int, total: int) -> None:
@@ -76,7 +76,7 @@ def test_in_the_fit_the_cloud_so_far_is_the_volume(
         whole = load_volume(tmp_path / "whole.nii.gz").data
         assert np.abs(volume - whole).max() > 0
         assert np.corrcoef(volume[whole > 0], whole[whole > 0])[0, 1] > 0.95
-        # and on to the same end, over the partial result
+        # and resumed to the same end, replacing the partial result
         interrupt_at("nothing", 0)
         assert case.run(out, "--resume") == 0
         assert (out / "volume.nii.gz").read_bytes() == case.volume
@@ -99,7 +99,7 @@ def test_before_the_fit_to_slices_the_prior_is_the_volume(
         assert json.loads((out / "run.json").read_text())["stopped_at"]["stage"] == "fit to prior"
         volume, prior, mask = (load_volume(out / f"{name}.nii.gz").data for name in ("volume", "prior", "mask"))
         np.testing.assert_array_equal(volume[mask > 0], prior[mask > 0])
-        assert (np.abs(volume) <= np.abs(prior)).all()  # it fades at its edge
+        assert (np.abs(volume) <= np.abs(prior)).all()  # the volume fades at its edge
         assert len(GaussianCloud.load(out / "gaussians.npz")) == 0
 
 
@@ -130,7 +130,7 @@ def test_a_second_signal_ends_at_once(
 def test_while_the_result_is_written_it_is_finished(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
 ) -> None:
-    """Of a run without a fit, too: nothing before it postpones a stop."""
+    """This also holds for a run without a fit, where no earlier stage postpones a stop."""
     record = RunRecord.read(case.config)
     config = tmp_path / "run.json"
     config.write_text(replace(record, settings=replace(record.settings, n_lattices=0)).to_json())

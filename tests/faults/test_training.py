@@ -1,4 +1,4 @@
-"""Training that is killed goes on at the same losses; its checkpoints are whole."""
+"""A killed training resumes with the same losses, and its checkpoints are complete."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from g3r.training.prior_module import PriorModule
 from tests.training.small_runs import Losses
 
 NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2, template_spacing_mm=3.0)
-# ten patches an epoch in batches of three: one is left over each time
+# ten patches per epoch in batches of three leave one over each time
 DATA: dict[str, Any] = {
     "spacing_mm": 2.0,
     "patch_size": 24,
@@ -46,7 +46,7 @@ N_EPOCHS = 4
 
 
 def trained(folder: Path, end_at: int | None = None, resume: Path | None = None) -> dict[int, float]:
-    """Losses by step of a tiny training."""
+    """Losses of a tiny training by step."""
     lightning.seed_everything(5)
     losses = Losses(end_at)
     best = lightning.callbacks.ModelCheckpoint(folder, filename="best", monitor="val/l1_prior")
@@ -82,7 +82,7 @@ def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path:
 
 
 @pytest.mark.faults
-@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes to the same folder
 @pytest.mark.parametrize("end_at", [4, 11])
 def test_a_training_that_ended_goes_on_at_the_same_losses(
     whole: dict[int, float], tmp_path: Path, tally: Tally, end_at: int
@@ -91,7 +91,7 @@ def test_a_training_that_ended_goes_on_at_the_same_losses(
         begun = trained(tmp_path, end_at)
         assert begun == {step: whole[step] for step in range(1, end_at + 1)}
         resumed = trained(tmp_path, resume=tmp_path / "last.ckpt")
-        last_epoch = (end_at - 1) // 3 * 3  # checkpoints are written when an epoch has ended
+        last_epoch = (end_at - 1) // 3 * 3  # checkpoints are written at the end of an epoch
         assert resumed == {step: loss for step, loss in whole.items() if step > last_epoch}
 
 
@@ -111,7 +111,7 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
         one.refused()
     with tally.case():
         living = process_mark()
-        for mark in (f"{living.partition('-')[0]}-4194399", living):  # nobody's, and a living one's
+        for mark in (f"{living.partition('-')[0]}-4194399", living):  # of an ended and of a living process
             (tmp_path / f".{mark}-0.last.ckpt").write_text("")
         assert torch.equal(keeper.load_checkpoint(path, weights_only=True)["a"], torch.ones(3))
         left = {one.name for one in tmp_path.iterdir()}
@@ -152,7 +152,7 @@ def command(folder: Path, *options: str) -> list[str]:
 
 
 def losses(folder: Path) -> dict[int, float]:
-    """Of every step, as the logs of all runs say; later runs last."""
+    """Loss of every step from the logs of all runs; later runs override earlier ones."""
     found: dict[int, float] = {}
     for path in sorted(folder.glob("run/version_*/metrics.csv")):
         with path.open() as file:
@@ -184,7 +184,7 @@ def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: 
     with tally.case():
         done = subprocess.run(command(folder, "--ckpt_path", str(last)), check=False, **quiet)
         assert done.returncode == 0, done.stderr
-        # one process's sums may be rounded otherwise than another's, and a training carries that on
+        # sums may be rounded differently in another process, and training propagates the difference
         assert losses(folder) == pytest.approx(losses(tmp_path / "whole"), rel=1e-4)
         assert len(losses(folder)) == 15
         assert not list(folder.glob("kept/.*"))

@@ -1,4 +1,4 @@
-"""Input that is odd and usable all the same: accepted, read right, remarked on where a user should know."""
+"""Unusual but usable input: accepted, read correctly, with a warning where a user should know."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def oblique(spacing: tuple[float, float, float] = (1, 1, 3)) -> np.ndarray:
 
 
 def typed(dtype: Any, slope: float = 1.0, inter: float = 0.0) -> Maker:
-    """The good image rounded, stored as a type with a scaling; its values are those of `image`."""
+    """The good image rounded and stored as a type with a scaling; its values are those of `image`."""
 
     def make(folder: Path) -> Path:
         stored = np.rint((image() - inter) / slope).astype(dtype)
@@ -66,7 +66,7 @@ def linked(folder: Path) -> Path:
 
 
 def in_members(folder: Path) -> Path:
-    """gzip files may be put behind each other, as pigz and bgzip do."""
+    """A concatenation of gzip members, as written by pigz and bgzip."""
     whole = raw()
     (folder / "odd.nii.gz").write_bytes(gzip.compress(whole[:5000]) + gzip.compress(whole[5000:]))
     return folder / "odd.nii.gz"
@@ -83,7 +83,7 @@ DENSE = AFFINE @ np.diag([1.0, 1.0, 0.34, 1.0])
 THIN = AFFINE @ np.diag([2.0, 2.0, 0.3, 1.0])
 
 STACKS: dict[str, tuple[Maker, str]] = {
-    # how it is stored
+    # storage
     "uint8": (typed(np.uint8, 4.0, 100.0), ""),
     "int16": (typed(np.int16), ""),
     "int16 with a scaling": (typed(np.int16, 0.05, -20.0), ""),
@@ -114,7 +114,7 @@ STACKS: dict[str, tuple[Maker, str]] = {
     "a line break": (lambda folder: write(folder / "odd\none.nii.gz"), ""),
     "begins with a dot": (lambda folder: write(folder / ".nii.gz"), ""),
     "a link": (linked, ""),
-    # where it lies
+    # location and geometry
     "oblique": (lambda folder: write(folder / "odd.nii.gz", image(), oblique()), ""),
     "left-handed": (lambda folder: write(folder / "odd.nii.gz", image(), oblique((1, 1, -3))), ""),
     "negative spacings": (lambda folder: write(folder / "odd.nii.gz", image(), oblique((-1, -1, -3))), ""),
@@ -139,7 +139,7 @@ STACKS: dict[str, tuple[Maker, str]] = {
         header("odd.nii.gz", qform_code=0, pixdim=[1, 0, 0, 0, 0, 0, 0, 0]),
         "pixdim.* should be non-zero",
     ),
-    # what is in it
+    # content
     "500 slices": (lambda folder: write(folder / "odd.nii.gz", image(shape=(24, 20, 500)), DENSE), ""),
     "slices thinner than pixels": (
         lambda folder: write(folder / "odd.nii.gz", image(), THIN),
@@ -156,7 +156,7 @@ STACKS: dict[str, tuple[Maker, str]] = {
 }
 
 USUAL = "thickness taken as the distance of slices"
-"""A remark on every image that comes alone."""
+"""Warning for every image without a sidecar."""
 
 AS_GOOD = ("one frame", "frames of one", "gzip members", "NIfTI-2", "big-endian", "header and voxels apart")
 
@@ -202,7 +202,7 @@ MASKS: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], str]] = {
 
 
 @pytest.mark.parametrize("name", MASKS)
-def test_a_mask(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally) -> None:
+def test_an_odd_mask_is_read_right(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally) -> None:
     data, affine = MASKS[name][0]()
     stack, mask = write(tmp_path / "stack.nii.gz"), write(tmp_path / "mask.nii.gz", data, affine)
     with tally.case(), caplog.at_level(logging.WARNING):
@@ -225,7 +225,7 @@ def test_twelve_stacks(tmp_path: Path, tally: Tally) -> None:
 
 
 @pytest.mark.parametrize("kind", ["new", "deep", "empty", "spaces and more ä", "earlier result"])
-def test_an_output(kind: str, tmp_path: Path, tally: Tally) -> None:
+def test_a_new_empty_or_forced_output_folder_is_accepted(kind: str, tmp_path: Path, tally: Tally) -> None:
     folder = tmp_path / "a" / "b" / "c" if kind == "deep" else tmp_path / kind
     options: list[str] = []
     if kind in ("empty", "earlier result"):
@@ -240,7 +240,7 @@ def test_an_output(kind: str, tmp_path: Path, tally: Tally) -> None:
 
 
 def test_names_that_are_no_text_as_a_process(tmp_path: Path, tally: Tally) -> None:
-    """Bytes that are no UTF-8, in the stack's name and the output's, with an ASCII terminal."""
+    """Names of stack and output have bytes that are not UTF-8, with an ASCII terminal."""
     name = os.fsencode(tmp_path) + b"/kopf-\xe4\xff.nii.gz"
     Path(os.fsdecode(name)).write_bytes(write(tmp_path / "a.nii.gz").read_bytes())
     line: list[str | bytes] = [

@@ -1,4 +1,4 @@
-"""The edge of the volume by the image: found where all beside the brain is black, else left to the masks."""
+"""The edge by the image: found if everything beside the brain is black, otherwise left to the masks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.gaussians.scenes import slices_of, stack_planes
 GRID = VolumeGrid.isotropic([-16] * 3, [16] * 3, 1.0)
 RADIUS_MM = np.linalg.norm(GRID.world(np.moveaxis(np.indices(GRID.shape), 0, -1)), axis=-1)
 BRAIN_MM, SUPPORT_MM = 7.5, 9.0
-"""Radius of the brain, and of what masks that are drawn wide make of it."""
+"""Radius of the brain, and of its generously drawn masks."""
 SUPPORT = RADIUS_MM < SUPPORT_MM
 TISSUE = 0.6 + 0.1 * np.sin(GRID.world(np.moveaxis(np.indices(GRID.shape), 0, -1))[..., 0] / 2)
 NEAR = RADIUS_MM < SUPPORT_MM + 1
@@ -29,7 +29,7 @@ NEAR = RADIUS_MM < SUPPORT_MM + 1
 def slices_that_see(
     beside: float, gain: NDArray[np.float64] | None = None, noise: float = 0.01, mask_mm: float = SUPPORT_MM
 ) -> Slices:
-    """Three stacks of a ball of tissue with a value beside it."""
+    """Three stacks of a ball of tissue with a given intensity beside it."""
     planes = stack_planes(14, 2.0, 30)
     scene = np.where(RADIUS_MM < BRAIN_MM, TISSUE, beside).astype(np.float32)
     operator = VoxelOperator(planes, GRID, np.arange(planes.n_pixels), (3, 3, 5))
@@ -45,7 +45,7 @@ def slices_that_see(
 def shown(
     slices: Slices, gain: NDArray[np.float64] | None = None, bias_field: list[list[float]] | None = None
 ) -> NDArray[np.float32] | None:
-    """Of a volume that goes on beyond the brain, as one that is fitted to masked pixels does."""
+    """Edge of a volume that extends beyond the brain, as a volume fitted to masked pixels does."""
     ones = np.ones(len(slices))
     fit = SliceFit(
         cloud=true_cloud(),
@@ -61,7 +61,7 @@ def shown(
 
 
 def errors(found: NDArray[np.float32] | None) -> tuple[float, float]:
-    """Mean of what lacks inside the brain, and of what is shown beside it, in the two voxels next to its edge."""
+    """Mean deficit inside the brain and mean excess beside it, in the two voxels next to its edge."""
     assert found is not None
     inside = (RADIUS_MM < BRAIN_MM - 0.5) & (RADIUS_MM > BRAIN_MM - 2)
     beside = (RADIUS_MM > BRAIN_MM + 0.5) & NEAR
@@ -72,7 +72,7 @@ def test_the_volume_ends_where_the_image_becomes_black() -> None:
     found = shown(slices_that_see(0.0))
     lacking, beside = errors(found)
     assert lacking < 0.02
-    assert beside < 0.25  # all of it was shown
+    assert beside < 0.25  # without the edge all of it would be shown
     assert found is not None
     assert (found[SUPPORT & (RADIUS_MM < SUPPORT_MM - FULL_MM - 1)] == 1).all()
 
@@ -85,11 +85,11 @@ def test_gains_and_noise_do_not_move_the_edge() -> None:
     very_noisy = errors(shown(slices_that_see(0.0, noise=0.12)))
     np.testing.assert_allclose(uneven, even, atol=0.03)
     np.testing.assert_allclose(noisy, even, atol=0.1)
-    np.testing.assert_allclose(very_noisy, even, atol=0.25)  # the mean of such noise is a quarter of tissue
+    np.testing.assert_allclose(very_noisy, even, atol=0.25)  # mean of such noise: a quarter of tissue
 
 
 def test_the_field_of_the_fit_is_that_of_its_masks() -> None:
-    """Terms of a field have no mean over masked pixels; over all pixels of the boxes they would be others."""
+    """Terms of a field have zero mean over masked pixels, so over all pixels of the boxes they would differ."""
     slices = slices_that_see(0.0)
     field = [[0.0, 0.0, 20.0, 0.0, 20.0]] * 3
     under = np.exp(StackBiasField(slices).log_field(np.array(field)))
@@ -121,7 +121,7 @@ def test_voxels_that_are_too_fine_for_the_pixels_are_left_to_the_masks() -> None
 
 
 def test_what_a_mask_leaves_out_is_not_taken_away() -> None:
-    """The brain reaches beyond a support that is too small: nothing of it fades."""
+    """If the brain reaches beyond a support that is too small, it does not fade."""
     slices = slices_that_see(0.0, mask_mm=6.0)
     ones = np.ones(len(slices))
     fit = SliceFit(cloud=true_cloud(), slices=slices, gain=ones, weight=ones, history=[], bias_field=[])

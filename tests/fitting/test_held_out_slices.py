@@ -1,4 +1,4 @@
-"""Held-out slices find profiles that are narrower or wider than stated."""
+"""Held-out slices detect profiles that are narrower or wider than stated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.fitting.scene import make_slices, true_cloud
 
 
 def start(width: float) -> tuple[PriorVolume, GaussianCloud]:
-    """V_sharp and its Gaussians, of slices whose profile through the plane is `width` times what they say."""
+    """V_sharp and its Gaussians, from slices whose through-plane profile is `width` times the stated one."""
     slices = make_slices()
     planes = replace(slices.planes, psf_var_mm2=slices.planes.psf_var_mm2 * [1, 1, width**2])
     slices = replace(slices, value=render(true_cloud(), planes, cutoff_sigma=6.0).numpy())
@@ -66,7 +66,7 @@ def test_the_width_of_the_profile_is_found(width: float) -> None:
     assert found.mean_width is not None
     assert found.widths is not None
     assert (found.mean_width < 0.92) if width < 1 else (found.mean_width > 1.08)
-    taken = math.prod(found.widths) ** (1 / 3)  # half way to the nominal one
+    taken = math.prod(found.widths) ** (1 / 3)  # the fit takes half the deviation from the nominal width
     assert abs(math.log(taken)) == pytest.approx(abs(math.log(found.mean_width)) / 2, abs=0.02)
     assert len(found.error) == 3
     assert found.n_slices >= 3
@@ -84,7 +84,7 @@ def test_each_stack_has_a_width_of_its_own() -> None:
     few = slices.take(np.r_[0:2, 8:24])  # two slices of a stack say nothing
     of_few = held_out_fit(cloud, few)
     np.testing.assert_array_equal(of_few.relative_widths(np.arange(3)), 1)
-    # a stack of which no slice was held out has a width, too: the fit takes one for each stack of the run
+    # a stack without held-out slices has a width too, because the fit takes one per stack
     without = slices.take(slices.stack_id != 1)
     of_two = held_out_fit(cloud, without)
     np.testing.assert_array_equal(of_two.relative_widths(np.arange(3)), np.ones(3))
@@ -93,7 +93,7 @@ def test_each_stack_has_a_width_of_its_own() -> None:
 def test_the_lowest_of_a_parabola_lies_between_the_widths() -> None:
     widths = (0.7, 0.85, 1.0, 1.2)
     assert lowest(widths, [(math.log(width / 0.9)) ** 2 + 1 for width in widths]) == pytest.approx(0.9)
-    assert lowest(widths, [4.0, 3.0, 2.0, 1.0]) == pytest.approx(1.2, abs=0.15)  # not far beyond what was tried
+    assert lowest(widths, [4.0, 3.0, 2.0, 1.0]) == pytest.approx(1.2, abs=0.15)  # not far beyond the tested widths
     assert lowest(widths, [1.0, 1.001, 1.0, 1.001]) is None
 
 

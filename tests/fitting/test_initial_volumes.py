@@ -1,4 +1,4 @@
-"""The volumes that a fit starts from: whole slices, masked pixels, and room for a head that was cut off."""
+"""Initial volumes of a fit: density of whole slices and of masked pixels, and room for a cut-off head."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def volumes_of(slices: Slices, box: tuple[np.ndarray, np.ndarray] | None = None)
 
 @pytest.fixture(scope="module")
 def missing() -> InitialVolumes:
-    """Of a ball with a missing slab."""
+    """Initial volumes of a ball with a missing slab."""
     return volumes_of(slices_of_a_ball(slice(11, 14)))
 
 

@@ -1,4 +1,4 @@
-"""Gains and fields come out as far as crossing slices determine them; what they share stays in the volume."""
+"""Intensity matching recovers gains and fields as far as crossing slices determine them; common parts stay."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.registration.moving_heads import as_slices, simulated
 
 @pytest.fixture(scope="module")
 def plain() -> Slices:
-    """Three stacks of a phantom in true poses, every slice as bright as the head."""
+    """Three stacks of a phantom in true poses, with gain 1 in every slice."""
     slices, _ = as_slices(simulated(fetal_brain_phantom(24, 1.2)))
     return slices
 
@@ -33,13 +33,13 @@ def shown(slices: Slices, log_gain: NDArray[np.float64], coefficients: NDArray[n
 
 
 def matched(slices: Slices, weight: NDArray[np.float64] | None = None) -> tuple[NDArray[np.float64], Slices]:
-    """Log-gains [K] of matched slices that started with none, and the slices without fields."""
+    """Log-gains [K] found from initial gains of 1, and the slices without fields."""
     found = match_intensities(slices, np.ones(len(slices)), np.ones(len(slices)) if weight is None else weight)
     return np.log(found.gain), found.slices
 
 
 def differences(slices: Slices, gain: NDArray[np.float64], reference: Slices) -> NDArray[np.float64]:
-    """Logarithm [P'] of matched intensities over those of other slices."""
+    """Logarithm [P'] of the ratio of matched intensities to those of other slices."""
     index = slices.pixel_index[reference.masked_value > 0.2 * reference.masked_value.max()]
     plane = slices.planes.plane_id()[index]
     return np.asarray(np.log(slices.value[index] / reference.value[index]) - gain[plane])
@@ -55,7 +55,7 @@ def test_gains_of_single_slices_are_found(plain: Slices, rng: np.random.Generato
 
 
 def test_fields_in_plane_that_no_volume_shares_are_found(plain: Slices) -> None:
-    """x y of the first two stacks, in planes of their own."""
+    """The fields are x y of the first two stacks, in their own planes."""
     coefficients = np.zeros((3, N_TERMS))
     coefficients[0, 3], coefficients[1, 3] = 0.4, -0.3
     start_gain, start = matched(plain)
@@ -66,7 +66,7 @@ def test_fields_in_plane_that_no_volume_shares_are_found(plain: Slices) -> None:
 
 
 def test_what_a_volume_shares_is_left_in_the_slices(plain: Slices) -> None:
-    """A head that is brighter on one side comes out brighter there: nobody can tell it from a coil."""
+    """A head that is brighter on one side stays so, since this cannot be distinguished from a coil."""
     world_mm = plain.planes.pixel_world_mm()
     shading = 0.2 * (world_mm[:, 0] - world_mm[plain.mask, 0].mean()) / 40.0
     shaded = replace(plain, value=(plain.value * np.exp(shading)).astype(np.float32))
@@ -80,7 +80,7 @@ def test_what_a_volume_shares_is_left_in_the_slices(plain: Slices) -> None:
 
 
 def test_trends_that_registration_made_up_are_gone(plain: Slices) -> None:
-    """Each stack's gains fall to both ends, as if the head were darker there."""
+    """The gains of each stack fall towards both ends, as if the head were darker there."""
     header = plain.header_pose
     along = np.zeros(len(plain))
     for stack in np.unique(plain.stack_id):
@@ -128,7 +128,7 @@ def test_dark_and_extreme_slices_give_finite_gains(plain: Slices) -> None:
 
 
 def test_a_rim_of_skull_and_fluid_in_the_masks_hardly_disturbs_the_brain() -> None:
-    """Thin shells of strong contrast, as people's masks have them, around slices without gains or fields."""
+    """Thin shells of strong contrast, as in hand-drawn masks, around slices without gains or fields."""
     head = fetal_brain_phantom(24, 1.2)
     outside_mm = distance_transform_edt(~head.mask, sampling=1.2)
     bright = float(head.t2.max())

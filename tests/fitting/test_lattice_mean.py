@@ -1,4 +1,4 @@
-"""Several fits on lattices of their own: one cloud that is their mean, ended by the clock and by a stop request."""
+"""The mean cloud of several fits on different lattices; ends by the clock and by a stop request."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_progress_counts_all_fits(prior: PriorVolume) -> None:
 def test_the_clock_decides_how_many_there_are_and_a_later_run_repeats_it(prior: PriorVolume) -> None:
     record = LoopRecord()
     fit = fitted(prior, 4, deadline=Deadline.after(-1.0))
-    assert not fit.further  # the first is made even so
+    assert not fit.further  # the first fit is always made
     late = Deadline(loop_record=record)
     assert len(fitted(prior, 3, deadline=late).further) == 2
     again = Deadline(end_s=-np.inf, loop_record=LoopRecord(record.loops, repeating=True))

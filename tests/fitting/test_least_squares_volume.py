@@ -1,4 +1,4 @@
-"""The least-squares volume: sharper than V_coarse, right at the rim whatever lies beside the brain, in any units."""
+"""V_sharp: sharper than V_coarse, correct at the rim whatever lies beside the brain, in any units."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RADIUS_MM, THICKNESS_MM, VOXEL_MM = 18.0, 4.0, 1.5
 
 
 def true_at(points_mm: np.ndarray, beside: float) -> np.ndarray:
-    """A ball with a pattern of 12 mm, and something of one intensity beside it."""
+    """A ball with a pattern of 12 mm, and uniform surroundings."""
     inside = np.linalg.norm(points_mm, axis=-1) < RADIUS_MM
     pattern = 1 + 0.4 * np.sin(2 * np.pi * points_mm / 12).prod(-1)
     return np.where(inside, pattern, beside)
@@ -54,7 +54,7 @@ def error(volume: np.ndarray, made: InitialVolumes, low_mm: float, high_mm: floa
 
 
 def shell_of(made: InitialVolumes, low_mm: float, high_mm: float) -> np.ndarray:
-    """Voxels at these distances from the middle of the ball."""
+    """Voxels at the given distances from the centre of the ball."""
     world = made.grid.world(np.stack(np.meshgrid(*map(np.arange, made.grid.shape), indexing="ij"), -1))
     radius = np.linalg.norm(world, axis=-1)
     return (radius >= low_mm) & (radius < high_mm)
@@ -104,7 +104,7 @@ def test_a_slice_beside_its_place_makes_no_bright_crust(monkeypatch: pytest.Monk
     pose, away = made.slices.planes.pose, np.zeros((len(made.slices), 3))
     away[np.flatnonzero(made.slices.stack_id == 2)[6], 0] = 7.0
     moved = replace(made, slices=made.slices.with_pose(replace(pose, translation_mm=pose.translation_mm + away)))
-    support = shell_of(made, 0, RADIUS_MM + 1.0)  # as the other slices see it
+    support = shell_of(made, 0, RADIUS_MM + 1.0)  # as seen by the other slices
     ones = np.ones(len(made.slices))
 
     def brightest_crust() -> float:
@@ -117,7 +117,7 @@ def test_a_slice_beside_its_place_makes_no_bright_crust(monkeypatch: pytest.Monk
 
 
 def noisy(made: InitialVolumes, noise: float, n_stacks: int = 3) -> InitialVolumes:
-    """The same with noise of a standard deviation in normalised intensities, and fewer stacks."""
+    """Initial volumes of fewer stacks, with noise of a given standard deviation in normalised intensities."""
     slices = made.slices.take(made.slices.stack_id < n_stacks)
     more = np.random.default_rng(0).normal(0, noise, slices.value.shape)
     slices = replace(slices, value=(slices.value + more).astype(np.float32))
@@ -139,7 +139,7 @@ def test_noise_is_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_slices_of_a_single_stack_disagree_by_is_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One slice in eight is far off: that counts in full there, and hardly where other stacks check the poses."""
+    """One slice in eight is far off. In a single stack that counts fully, with several stacks hardly at all."""
     asked: list[float] = []
 
     def for_noise(settings: VoxelProblemSettings, noise: float) -> VoxelProblemSettings:

@@ -1,4 +1,4 @@
-"""Masks that were found, after the vote of other stacks and the template."""
+"""Correction of found masks by the vote of other stacks and the template."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from g3r.registration import Registration
 RADIUS_MM = 22.0
 N, SPACING_MM, SLICE_MM = 48, 1.5, 3.0
 MOVED = RigidPose.from_rotvec(np.array([[0.1, -0.05, 0.08]]), np.array([[3.0, -2.0, 4.0]]))
-"""The world of the result from the header."""
+"""Motion from the header's world to that of the result."""
 
 
 def ball(points_mm: np.ndarray) -> np.ndarray:
@@ -26,7 +26,7 @@ def ball(points_mm: np.ndarray) -> np.ndarray:
 
 
 def stack(axis: int, source: MaskSource = "automatic") -> Stack:
-    """Slices along an axis through a ball, which the header shows where it was before it moved."""
+    """Slices along an axis through a ball; the header has the ball's position before it moved."""
     n_slices = 20
     order = [a for a in range(3) if a != axis] + [axis]
     affine = np.zeros((4, 4))
@@ -61,7 +61,7 @@ def registered(stacks: list[Stack]) -> tuple[Registration, float]:
 
 
 def template() -> PlacedTemplate:
-    """A ball where the moved one is."""
+    """A template ball at the place of the moved ball."""
     grid = VolumeGrid.isotropic([-40] * 3, [40] * 3, 2.0)
     world_mm = grid.world(np.moveaxis(np.indices(grid.shape), 0, -1))
     return PlacedTemplate(ball(world_mm - MOVED.translation_mm[0]).astype(np.float32), grid)
@@ -72,7 +72,7 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def with_a_bite(good: Stack) -> Stack:
-    """A quarter of the brain is missed in some slices, and something beside it is taken for brain in others."""
+    """A mask that lacks a quarter of the brain in some slices and includes surroundings in others."""
     mask = good.mask.copy()
     mask[: N // 2, : N // 2, 8:12] = False
     mask[35:44, 20:30, 5:8] = True
@@ -104,7 +104,7 @@ def test_slices_stay_where_they_are_and_carry_the_new_masks() -> None:
         np.testing.assert_allclose(
             getattr(after.world_from_header(), name), getattr(before.world_from_header(), name), atol=1e-9
         )
-    # header and motion together put a masked pixel where the ball is
+    # header and motion together place masked pixels in the ball
     inside_mm = after.planes.pixel_world_mm(after.pixel_index) - MOVED.translation_mm[0]
     assert np.mean(np.linalg.norm(inside_mm, axis=1) < RADIUS_MM + 3) > 0.98
     first = after.pixel_index[0]

@@ -1,4 +1,4 @@
-"""Gains of a single stack come out as far as they change from slice to slice."""
+"""Gains of a single stack are recovered as far as they change from slice to slice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.registration.moving_heads import as_slices, simulated
 
 @pytest.fixture(scope="module")
 def alone() -> Slices:
-    """One stack of a phantom, every slice as bright as the head."""
+    """One stack of a phantom, with gain 1 in every slice."""
     slices, _ = as_slices(simulated(fetal_brain_phantom(24, 1.2), n_stacks=1))
     return slices
 

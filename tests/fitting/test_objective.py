@@ -1,4 +1,4 @@
-"""The explicit objective against autograd of the same loss through render(), and finite differences."""
+"""The explicit objective against autograd of the same loss through the reference, and finite differences."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def volume() -> np.ndarray:
 class Scene:
     """A loss with every term, at a point where nothing is zero.
 
-    At a cut-off of 6 sigma the dense reference sees the same image.
+    At a cut-off of 6 sigma the dense reference gives the same image.
     """
 
     def __init__(self, volume: np.ndarray, seed: int, cutoff_sigma: float = CUTOFF_SIGMA) -> None:
@@ -87,7 +87,7 @@ class Scene:
         return self.image.mean + STRENGTH * distance + regulariser + others
 
     def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
-        """The same in float64 through the dense reference and autograd, term by term as Eq. 9 has them."""
+        """The loss in float64 through the dense reference and autograd, term by term as in Eq. 9."""
         leaves = {name: torch.tensor(v).double().requires_grad_() for name, v in self.parameters.value.items()}
         cloud = GaussianCloud.of(
             [leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
@@ -121,7 +121,7 @@ def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume:
     assert scene.evaluate() == pytest.approx(expected, rel=1e-5)
     for name, gradient in expected_gradient.items():
         found = scene.parameters.gradient[name]
-        # |residual| has a kink: a pixel on it may fall to the other side
+        # |residual| has a kink, and rounding may put a pixel on the other side of it
         assert np.linalg.norm(found - gradient) < 2e-3 * np.linalg.norm(gradient), name
 
 
@@ -139,7 +139,7 @@ def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray) -> No
         for sign in (1, -1):
             value[...] = start + sign * direction
             values.append(scene.evaluate())
-            # the image's value scales the pose prior as a constant
+            # the pose prior is scaled by the image term, which has no gradient there
             one = replace(scene.image, mean=1.0)
             values[-1] += (image - scene.image.mean) * scene.unknowns.finish(one, SETTINGS.pose_prior_mm, 0.0)
         value[...] = start
@@ -172,7 +172,7 @@ def alone(parameters: FitParameters, term: ImageTerm) -> float:
 
 
 def test_no_pair_is_missed_while_things_move(volume: np.ndarray) -> None:
-    """The list in use always holds every pair within the cut-off, and it is not made anew at every step."""
+    """The current overlap list always holds every pair within the cut-off, and is not rebuilt at every step."""
     scene = Scene(volume, 6)
     for _ in range(12):
         loss = scene.evaluate()

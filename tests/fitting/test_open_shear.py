@@ -1,4 +1,4 @@
-"""The shear that two orientations leave open in a fit: it changes no pixel, and the fit follows it."""
+"""The open shear of two orientations as a parameter of the fit: it changes no pixel, and the fit finds it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ X, Y, Z = np.eye(3)
 
 
 def turned_slices() -> Slices:
-    """Two stacks whose slices are turned against each other, as jerks turn them, with the pixels of the true cloud."""
+    """Two stacks whose slices are rotated against each other, as by jerks, with the pixels of the true cloud."""
     slices = make_slices()
     slices = slices.take(slices.stack_id < 2)
     turn = Rotation.from_rotvec(np.random.default_rng(1).normal(0, 0.12, (len(slices), 3))).as_matrix()
@@ -47,7 +47,7 @@ def blocks_of(slices: Slices, *, optimise_poses: bool = True) -> dict[str, Block
 
 
 def sheared(slices: Slices, amount: float) -> tuple[GaussianCloud, Slices]:
-    """The true cloud and slices, both moved by a shear."""
+    """The true cloud and slices after a common shear."""
     parameters, shear = parameters_of(slices)
     parameters.value["shear"][0] = amount
     shear.fold(parameters)
@@ -59,7 +59,7 @@ def sheared(slices: Slices, amount: float) -> tuple[GaussianCloud, Slices]:
 
 
 def reshaped(cloud: GaussianCloud, motion: np.ndarray) -> GaussianCloud:
-    """Gaussians whose shapes follow a linear motion [3, 3], too, which a fit leaves to their own parameters."""
+    """Gaussians whose shapes also follow a linear motion [3, 3], which the fit leaves to their own parameters."""
     frame = rotation_from_quaternion(cloud.quaternion_wxyz).numpy()
     half = motion @ frame * np.exp(cloud.log_scale.numpy())[:, None]
     variance, axes = np.linalg.eigh(half @ half.transpose(0, 2, 1))
@@ -76,7 +76,7 @@ def test_slices_and_gaussians_that_move_together_explain_the_same_pixels() -> No
         render(head, planes.planes, cutoff_sigma=6.0).numpy()
         for head, planes in ((true_cloud(), still), (cloud, slices), (true_cloud(), slices))
     )
-    # of second order, and the profile, which turns as slices do
+    # second-order error, and the error of the profile, which rotates with the slices
     assert np.abs(together - before).mean() < 0.1 * np.abs(alone - before).mean()
 
 
@@ -88,7 +88,7 @@ def test_the_slope_is_the_finite_difference_of_the_loss() -> None:
     def loss_at(amount: float) -> tuple[float, float]:
         parameters, _ = parameters_of(slices)
         ones = np.ones(len(slices))
-        # every slice in its turn; tails of Gaussians that are cut off would jump
+        # all slices; cut-off tails of Gaussians would make the loss jump
         settings = SliceStageSettings(n_parts=1, scale_weight=0.0, cutoff_sigma=6.0)
         loss = SliceLoss(
             parameters, slices, gain=ones, slice_weight=ones, bias_field=None, prior=None, settings=settings
@@ -103,13 +103,13 @@ def test_the_slope_is_the_finite_difference_of_the_loss() -> None:
 
 
 def strain_left(slices: Slices, true: Slices) -> float:
-    """How much of the open strain the poses differ by from the true ones."""
+    """Share of the open strain in the difference of the poses from the true ones."""
     strain = open_strain(mean_normals(true))
     assert strain is not None
     place = true.planes.center_mm - true.planes.center_mm.mean(0)
     away = slices.planes.center_mm - true.planes.center_mm
     away = away - away.mean(0)
-    # a common turn of all slices is no error
+    # a common rotation of all slices is not an error
     turns = [np.cross(axis, place).ravel() for axis in np.eye(3)]
     found = np.linalg.lstsq(np.stack([(place @ strain).ravel(), *turns], 1), away.ravel(), rcond=None)[0]
     return float(found[0])

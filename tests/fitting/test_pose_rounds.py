@@ -1,4 +1,4 @@
-"""Rounds of poses and volume bring slices nearer to the truth, and are undone where stacks predict each other worse."""
+"""Rounds of poses and volume bring slices closer to the truth, and are undone if stacks predict each other worse."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.fitting.scene import make_slices
 from tests.registration.moving_heads import with_jerk
 
 ERROR_MM = 0.6
-"""Standard deviation per axis of how far slices start from where they belong."""
+"""Standard deviation per axis of the initial displacement of slices."""
 
 
 def registration_of(slices: Slices) -> Registration:
@@ -50,7 +50,7 @@ def moved_away(slices: Slices) -> Slices:
 
 
 class PriorMaker:
-    """V_sharp of the slices as they are, and what was asked for."""
+    """A prior maker that returns V_sharp of the slices, and records its calls."""
 
     def __init__(self) -> None:
         self.last: list[bool] = []
@@ -83,7 +83,7 @@ def run(start: Registration, n_rounds: int) -> tuple[RefinedPoses, PriorMaker]:
 
 
 def error_mm(slices: Slices, true: Slices) -> float:
-    """Median distance of slices from where they belong, after their common shift."""
+    """Median distance of slices from their true places, after removal of their common shift."""
     away = slices.planes.center_mm - true.planes.center_mm
     return float(np.median(np.linalg.norm(away - away.mean(0), axis=1)))
 
@@ -132,7 +132,7 @@ def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: p
     assert found.record.n_kept == 0
     assert len(found.record.held_out) == 2
     assert found.registration is start
-    assert maker.last == [True]  # the first V_prior was a quick one
+    assert maker.last == [True]  # the first V_prior was made with the quick option
 
 
 def test_each_round_leaves_no_more_of_an_open_shear_than_motion_is_likely_to_have(

@@ -1,4 +1,4 @@
-"""The weight of V_prior in the volume follows how many pixels determine it."""
+"""The weight of V_prior in the volume depends on the number of pixels that determine it."""
 
 from __future__ import annotations
 

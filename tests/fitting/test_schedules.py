@@ -1,4 +1,4 @@
-"""How weights and step sizes change during a fit."""
+"""Schedules of weights and step sizes during a fit."""
 
 import math
 

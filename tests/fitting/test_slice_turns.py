@@ -1,4 +1,4 @@
-"""Steps on parts of the slices: who has a turn, and what its loss and gradient are."""
+"""Steps on parts of the slices: choice of the parts, their loss and gradient."""
 
 from dataclasses import replace
 from typing import Any
@@ -79,7 +79,7 @@ def test_the_parts_weighted_by_their_pixels_add_up_to_the_gradient_of_all(volume
 
 
 def test_the_loss_between_steps_is_that_of_all_slices_seen(volume: np.ndarray) -> None:
-    """Parts that fit differently do not look like a rise of the loss; weights wait for every slice."""
+    """Parts that fit differently do not count as a rise of the loss; weights change once all slices were seen."""
     weight = np.ones(24)
     loss = loss_of(volume, 2, weight)
     loss.evaluate(0.0)

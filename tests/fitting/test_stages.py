@@ -65,7 +65,7 @@ def test_a_volume_target_is_cropped_to_its_weight_and_taken_by_planes(volume: np
 
 def test_stage_2_lowers_the_loss_and_sharpens_the_volume(volume: np.ndarray) -> None:
     blurred, slices = 0.8 * volume + 0.1, make_slices()
-    # without any noise the jitter of the steps would be all that slices are weighted by
+    # without noise, slices would be weighted only by the jitter of the steps
     noise = np.random.default_rng(3).normal(0, 0.01, slices.value.shape).astype(np.float32)
     result = fit(blurred, replace(slices, value=slices.value + noise))
     image = [entry["image"] for entry in result.history]
@@ -73,7 +73,7 @@ def test_stage_2_lowers_the_loss_and_sharpens_the_volume(volume: np.ndarray) -> 
     assert np.mean(image[-5:]) < 0.6 * image[0]
     assert volume_error(result.cloud, volume) < 0.5 * volume_error(seeded(blurred), volume)
     assert "distillation" not in result.history[0]
-    assert (result.weight > 0.3).all()  # none is thrown out
+    assert (result.weight > 0.3).all()  # no slice is discarded
 
 
 def test_with_poses_off_no_slice_moves(volume: np.ndarray) -> None:

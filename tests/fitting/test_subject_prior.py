@@ -1,4 +1,4 @@
-"""Slices of a single stack move to their prior volume, and it with them, as long as that brings them nearer."""
+"""Slices of a single stack are registered to their prior volume, which is then remade, as long as this helps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STEP_MM = 0.25
 def test_moves_are_made_while_they_bring_slices_nearer(
     n_nearer: int, n_moves: int, n_made: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each from where the one before ended, towards the volume that was made there."""
+    """Each move starts at the end of the previous one, with the volume that was made there."""
     seen: list[NDArray[np.float32]] = []
 
     def moved(
@@ -45,7 +45,7 @@ def test_moves_are_made_while_they_bring_slices_nearer(
     assert after.accepted is (n_made > 0)
     assert len(seen) == min(n_nearer + 1, n_moves)
     assert len({one.tobytes() for one in seen}) == len(seen)
-    # intensities are those of the first volume, as the record says
+    # intensities are those of the first volume, as recorded
     first, last = before.volumes.slices, after.volumes.slices
     assert np.allclose(last.value * after.scale, first.value * before.scale, rtol=1e-5)
 

@@ -1,4 +1,4 @@
-"""A finished volume that explains the slices worse than V_prior is not written."""
+"""The volume check: a finished volume that explains the slices worse than V_prior is not written."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_residuals_rank_volumes_as_their_errors_do() -> None:
     assert "worse" in bad.line()
     assert good.volume == bad.prior
     assert 0 < good.volume < 0.02 < good.prior
-    assert good.coarse > good.volume  # it is blurred twice
+    assert good.coarse > good.volume  # V_coarse is blurred twice
 
 
 def test_gains_and_units_do_not_matter() -> None:
@@ -55,7 +55,7 @@ def test_gains_and_units_do_not_matter() -> None:
 
 
 def test_bias_fields_of_the_slices_are_not_held_against_a_volume_without_them() -> None:
-    """V_prior is made of biased slices and shows their bias; the fit divides it out."""
+    """V_prior is made from biased slices and shows their bias, which the fit divides out."""
     slices, truth = make_slices(), true_volume()
     steepness = 0.03 * np.array([1.0, -0.3, 0.5])
     biased = slices.value * np.exp(slices.planes.pixel_world_mm() @ steepness).astype(np.float32)
@@ -64,7 +64,7 @@ def test_bias_fields_of_the_slices_are_not_held_against_a_volume_without_them() 
     with_bias = (noisy * np.exp(GRID.world(INDEX) @ steepness)).astype(np.float32)
     found = check(truth, with_bias, slices=replace(slices, value=biased))
     assert not found.falls_back
-    assert found.volume < 0.05  # fields are of second order; an exponential is not
+    assert found.volume < 0.05  # the fitted fields are of second order, but the true one is an exponential
     wrong = check(np.roll(truth, 2, 0), with_bias, slices=replace(slices, value=biased))
     assert wrong.falls_back
 
@@ -95,7 +95,7 @@ def test_what_differs_by_less_than_the_check_can_tell_is_not_called_worse() -> N
 
 
 def reconstruction() -> ReconstructionResult:
-    """A small head with a fit as long as that of `fast`."""
+    """Reconstruction of a small head with as many steps as `fast`."""
     settings = replace(SETTINGS, slice_stage=PRESETS["fast"].slice_stage, gaussian_spacing_pixels=1.5)
     return GaussianReconstructor(settings=settings).reconstruct(small_stacks())
 

@@ -1,4 +1,4 @@
-"""The correction on voxels: it brings back what Gaussians lost, keeps what slices do not contradict, and says so."""
+"""The correction on voxels: restores detail lost by Gaussians, keeps what slices do not contradict, and reports it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.fitting.scene import BALL, GRID, INDEX, make_slices, true_cloud, true
 SETTINGS = VoxelCorrectionSettings(n_iterations=20)
 REACH = BALL.astype(np.float32)
 CORE = (GRID.world(INDEX) ** 2).sum(-1) < 7.0**2
-"""Away from the rim, at which slices end."""
+"""Voxels away from the rim, where slices end."""
 
 
 def fit_of(gain: NDArray[np.float64] | None = None) -> SliceFit:
@@ -76,7 +76,7 @@ def test_voxels_out_of_reach_stay_as_they_are() -> None:
 
 
 def test_kept_is_what_a_change_of_the_volume_leaves() -> None:
-    """As the mixture would change with another prior volume."""
+    """The reference is the change of the mixture with another prior volume."""
     soft = gaussian_filter(true_volume(), 0.8)
     change = np.random.default_rng(3).normal(size=GRID.shape)
     change = (0.02 * rms(soft) * gaussian_filter(change, 0.8) / gaussian_filter(change, 0.8).std()).astype(np.float32)
@@ -84,7 +84,7 @@ def test_kept_is_what_a_change_of_the_volume_leaves() -> None:
     after = change + two.values.astype(np.float64) - one.values
     left = float((after * change)[CORE].sum() / (change**2)[CORE].sum())
     assert 0.1 < left < 0.9
-    assert left - 0.03 < one.kept[CORE].mean() < left + 0.15  # it errs towards V_0
+    assert left - 0.03 < one.kept[CORE].mean() < left + 0.15  # the estimate errs towards V_0
 
 
 def test_a_weaker_pull_keeps_less() -> None:
@@ -101,7 +101,7 @@ def test_slices_without_weight_and_no_slices_correct_nothing() -> None:
 
 
 def test_fine_voxels_show_no_grid_of_pixels() -> None:
-    """A flat volume that is too dark for pixels of 1 mm becomes brighter, and nearly evenly so."""
+    """A uniform volume that is too dark for pixels of 1 mm becomes brighter almost uniformly."""
     fit = fit_of()
     slices = replace(fit.slices, value=np.full_like(fit.slices.value, 0.6))
     for voxel_mm, pattern in ((0.8, 0.1), (0.59, 0.25)):
@@ -135,7 +135,7 @@ def test_the_noisier_the_slices_the_stronger_the_pull() -> None:
 
 @pytest.mark.parametrize("n_stacks", [1, 3])
 def test_what_a_single_stack_disagrees_by_is_noise_in_full(n_stacks: int) -> None:
-    """One slice in eight is off. Where other stacks check the poses this hardly counts."""
+    """One slice in eight is off, which hardly counts if other stacks check the poses."""
     fit, off = fit_of(np.ones(24)), 5 * QUIET
     sign = np.random.default_rng(5).choice([-off, off], len(fit.slices.value)).astype(np.float32)
     value = fit.slices.value + np.where(fit.slices.planes.plane_id() % 8 == 3, sign, 0)

@@ -1,4 +1,4 @@
-"""Clouds, planes and slices of the tests."""
+"""Clouds, planes and slices for the tests."""
 
 from collections.abc import Iterator
 
@@ -81,7 +81,7 @@ def stack_planes(n: int, spacing_mm: float, side: int, origin: ArrayLike = (0.0,
 
 
 def slices_of(planes: Planes, value: np.ndarray, mask: np.ndarray, n_stacks: int, thickness_mm: float) -> Slices:
-    """Planes with pixels as the slices of stacks of equal length."""
+    """Planes with pixel values as slices of stacks of equal length."""
     n = len(planes) // n_stacks
     stack_id, index = np.repeat(np.arange(n_stacks), n), np.tile(np.arange(n), n_stacks)
     return Slices(

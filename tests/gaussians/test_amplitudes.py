@@ -1,4 +1,4 @@
-"""Amplitudes by conjugate gradients: the system's adjoint, exact recovery, and what is left alone."""
+"""Amplitudes by conjugate gradients: adjoint of the system, exact recovery, and unseen Gaussians."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_the_adjoint_of_the_system() -> None:
     system = AmplitudeSystem(cloud, planes, gain=rng.uniform(0.5, 2, len(planes)))
     amplitude, pixels = (rng.normal(size=n).astype(np.float32) for n in (len(cloud), planes.n_pixels))
     image, back = system.forward(amplitude).astype(np.float64), system.adjoint(pixels)
-    # both directions sum in float32
+    # both the system and its adjoint sum in float32
     assert abs(image @ pixels - amplitude @ back) < 1e-5 * np.linalg.norm(image) * np.linalg.norm(pixels)
 
 
@@ -110,7 +110,7 @@ def test_what_no_pixel_sees_stays() -> None:
     ones = np.ones(planes.n_pixels, np.float32)
     assert torch.equal(solve_amplitudes(cloud, away, ones, ones).amplitude, cloud.amplitude)
     assert torch.equal(solve_amplitudes(cloud, planes, ones, 0 * ones).amplitude, cloud.amplitude)
-    # one Gaussian out of sight among others that are seen
+    # one unseen Gaussian among seen ones
     mean = cloud.mean_mm.clone()
     mean[5] += 300
     lost = GaussianCloud.of((mean, *cloud.parameters[1:]), cloud.origin_mm)

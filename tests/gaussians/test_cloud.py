@@ -1,4 +1,4 @@
-"""The file of a cloud, and what is refused."""
+"""Saving and loading of a cloud, and refusals."""
 
 from pathlib import Path
 

@@ -60,7 +60,7 @@ def test_numba_gradients_agree_with_float64_autograd(seed: int, attenuation: str
         leaves, planes, weight, torch.float64, backend="reference", attenuation=attenuation
     )
     found, found_grad = gradients(leaves, planes, weight, torch.float32, cutoff_sigma=6.0, attenuation=attenuation)
-    # the cut-off at 6 sigma leaves 1.5e-8 of a amplitude, the polynomial exponential 2e-7
+    # the cut-off at 6 sigma leaves 1.5e-8 of an amplitude, the polynomial exponential 2e-7
     assert (found - expected).abs().max() < 3e-6 * expected.abs().max()
     for name, a, b in zip(NAMES, expected_grad, found_grad, strict=True):
         assert (a - b).norm() <= 1e-4 * a.norm(), name

@@ -1,4 +1,4 @@
-"""What must not change the pixels, and what gains, twists and amplitudes do to them."""
+"""Invariances of the pixels, and the effect of gains, twists and amplitudes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Both renderers against 3D quadrature of G3R Eq. 2, written here without their code; and without PSF."""
+"""Both renderers against an independent 3D quadrature of G3R Eq. 2, with and without PSF."""
 
 import numpy as np
 import pytest
@@ -25,8 +25,8 @@ def volume_at(cloud: GaussianCloud, points_mm: np.ndarray) -> np.ndarray:
 def quadrature(cloud: GaussianCloud, planes: Planes) -> np.ndarray:
     """Eq. 2: each pixel as the integral of PSF times V on a dense product grid out to 6.5 sigma.
 
-    Equidistant nodes converge exponentially for products of Gaussians: with nodes half the narrowest sigma of
-    the product apart the error is exp(-2 pi^2 4), beyond double precision; the tails hold 1e-10.
+    Equidistant nodes converge exponentially for products of Gaussians. With a node spacing of half the narrowest sigma
+    of the product the error is exp(-2 pi^2 4), beyond double precision; the tails hold 1e-10.
     """
     sigma_cloud = float(cloud.log_scale.exp().min())
     pixels = []
@@ -65,7 +65,7 @@ def test_both_backends_agree_with_quadrature(seed: int) -> None:
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
 def test_the_printed_attenuation_is_off_by_the_factor_of_the_design(backend: str) -> None:
-    """0.53 at sigma 1 mm, 0.8 mm pixels, 3 mm slices; quadrature sides with the exact form."""
+    """The factor is 0.53 at sigma 1 mm, 0.8 mm pixels, 3 mm slices; quadrature agrees with the exact form."""
     one = cloud_of(np.zeros((1, 3)), np.zeros((1, 3)), [[1.0, 0, 0, 0]], [1.0])
     planes = Planes(
         rotation=np.eye(3)[None],

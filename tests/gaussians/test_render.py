@@ -50,14 +50,14 @@ def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(log_s
     leaves = [p.float().requires_grad_() for p in cloud.parameters]
     twist = torch.zeros(len(planes), 6, requires_grad=True)
     found = render(GaussianCloud.of(leaves, cloud.origin_mm), planes, twist=twist, cutoff_sigma=6.0)
-    # means in float32 are off by 1e-8 mm, over sigma 0.02 a relative 1e-6 times the distance in sigmas
+    # float32 means are off by 1e-8 mm, at sigma 0.02 mm a relative 1e-6 times the distance in sigmas
     assert (found.detach() - expected).abs().max() < 1e-4 * max(1e-6, float(expected.abs().max()))
     found.square().sum().backward()
     assert all(torch.isfinite(gradient_of(leaf)).all() for leaf in (*leaves, twist))
 
 
 def test_large_and_slanted_ellipses_of_several_strips_agree_with_the_reference() -> None:
-    """Planes many times as wide as the sixteen pixels of a strip, cut by every border."""
+    """Planes are many times wider than the sixteen pixels of a strip, and ellipses are cut by every border."""
     base = make_cloud(24, 12, spread_mm=15)
     rng = np.random.default_rng(24)
     cloud = GaussianCloud.of(
@@ -73,7 +73,7 @@ def test_large_and_slanted_ellipses_of_several_strips_agree_with_the_reference()
 
 @pytest.mark.parametrize("cutoff", [2.0, 3.2, 4.5])
 def test_the_cut_off_bounds_the_error(cutoff: float) -> None:
-    """A pixel misses of each Gaussian at most its observed height times exp(-cutoff^2 / 2)."""
+    """The error of a pixel per Gaussian is at most its observed height times exp(-cutoff^2 / 2)."""
     cloud, planes = make_cloud(17, 20), make_planes(17, shape=(25, 25))
     exact = render(cloud, planes, backend="reference").numpy()
     found = render(single(cloud), planes, cutoff_sigma=cutoff).numpy()
@@ -82,7 +82,7 @@ def test_the_cut_off_bounds_the_error(cutoff: float) -> None:
     bound = float(cloud.amplitude.abs().sum()) * np.exp(-0.5 * cutoff**2) + 1e-6
     error = np.abs(found - exact).max()
     assert error < bound
-    assert error > 1e-4 * bound  # it does cut
+    assert error > 1e-4 * bound  # the cut-off has an effect
 
 
 def test_overlap_lists_with_a_margin_give_the_same_pixels_and_stay_valid() -> None:

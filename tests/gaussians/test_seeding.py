@@ -1,4 +1,4 @@
-"""Where the first Gaussians are, how many, and how flat a constant comes out."""
+"""Seeding: positions and number of the Gaussians, and flatness of a constant."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_a_constant_comes_out_flat(spacing: float) -> None:
 
 
 def test_seeds_are_flat_across_an_edge() -> None:
-    """At a step along the grid's third axis the smallest sigma points across it, in world axes."""
+    """At a step along the grid's third axis, the axis of the smallest sigma is normal to the step in world axes."""
     volume = (INDEX[..., 2] > 18.5).astype(np.float32)
     cloud = seed_cloud(volume, BALL, GRID, 2.0)
     third = GRID.index(cloud.mean_mm.double().numpy() + cloud.origin_mm)[:, 2]

@@ -1,4 +1,4 @@
-"""Voxel grids: index and world, the box that they cover, refusals."""
+"""Voxel grids: index and world coordinates, bounding boxes, resampling, refusals."""
 
 from typing import Any
 

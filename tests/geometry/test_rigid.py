@@ -1,4 +1,4 @@
-"""Rigid motions: algebra, rotation vectors, refusals, and the fit to points."""
+"""Rigid poses: algebra, rotation vectors, refusals, and the fit to points."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_rotation_vector_round_trip(angle: float) -> None:
     pose = RigidPose.from_rotvec(angle * axis, np.zeros((4, 3)))
     back = pose.rotvec_rad()
     np.testing.assert_allclose(np.linalg.norm(back, axis=1), angle, atol=1e-14, rtol=1e-9)
-    # a turn by pi has two rotation vectors: compare the motions, which must not jump
+    # a rotation by pi has two rotation vectors, so the motions are compared
     np.testing.assert_allclose(rotation_matrix(back), pose.rotation, atol=1e-9)
     if angle < 3:
         np.testing.assert_allclose(back, angle * axis, atol=1e-14, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""What brightness alone says of a stack."""
+"""Measures of a stack by brightness alone: detail and uneven brightness."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_folds_are_detail_and_noise_shading_and_the_edge_are_not(rng: np.random.
     small = detail_inside(shaded.astype(np.float32), inside, SPACING_MM)
     large = detail_inside((shaded * folds).astype(np.float32), inside, SPACING_MM)
     assert small < 0.012
-    # of a wave of 20 mm smoothing by 2 mm leaves 0.82 and that by 6 mm 0.17; its standard deviation is 0.14
+    # smoothing a wave of 20 mm by 2 mm leaves 0.82 of it and by 6 mm 0.17; its standard deviation is 0.14
     assert large == pytest.approx((0.82 - 0.17) * 0.14, rel=0.2)
 
 

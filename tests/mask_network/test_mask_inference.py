@@ -1,4 +1,4 @@
-"""From a stack to a mask: the way there and back, with a network that takes bright for brain; and refusals."""
+"""Mask inference from stack to mask, with a network that takes bright pixels for brain; refusals."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def stub() -> Any:
 
 
 class Watched(BrightIsBrain):
-    """Remembers what it saw."""
+    """Records its inputs."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class Watched(BrightIsBrain):
 
 
 class BlindAtFirst(Watched):
-    """Sees nothing in the first look at the whole stack."""
+    """Finds nothing in the first pass over the whole stack."""
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         logits = super().forward(image)
@@ -54,7 +54,7 @@ class BlindAtFirst(Watched):
 
 
 class BlindWhenTurned(Watched):
-    """Sees nothing in its second look."""
+    """Finds nothing in its second pass."""
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         logits = super().forward(image)
@@ -67,7 +67,7 @@ def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], rad
 
 
 def folded(inside: np.ndarray) -> np.ndarray:
-    """Something with as much detail as a brain, all of it bright."""
+    """A bright object with as much detail as a brain."""
     wave = np.sin(np.arange(len(inside)) * SPACING_MM[0] * 2 * np.pi / 20)[:, None, None]
     return (inside * (1 + 0.3 * wave)).astype(np.float32)
 
@@ -98,7 +98,7 @@ def test_a_ball_without_folds_is_no_head(stub: Any) -> None:
     found = find_brain(even.astype(np.float32), SPACING_MM, stub)
     assert not found.found
     assert "even" in found.reason
-    # where there is something with folds, it is that, though it is smaller
+    # an object with folds is preferred, although it is smaller
     found = find_brain(even + folded(head), SPACING_MM, stub)
     assert (found.mask & head).sum() > 0.9 * head.sum()
     assert not (found.mask & even).any()
@@ -120,14 +120,14 @@ def test_where_nothing_is_seen_a_second_look_has_even_brightness() -> None:
 
 @pytest.mark.parametrize("rival_mm", [0.0, 9.0, 30.0])
 def test_a_place_without_a_rival_is_looked_at_alone(rival_mm: float) -> None:
-    """One of nearly the same size is a rival, a much smaller one is none; either way the head is found."""
+    """Only a place of nearly the same size is a rival; the head is found in both cases."""
     head, other = ball((160, 140, 25), (60.0, 60.0, 40.0), 32.0), ball((160, 140, 25), (140.0, 140.0, 40.0), rival_mm)
     network = Watched()
     found = find_brain(folded(head) + 0.9 * folded(other), SPACING_MM, SimpleNamespace(network=network))  # type: ignore[arg-type]
     assert (found.mask & head).sum() > 0.9 * head.sum()
-    n_near = len(network.seen) - len(FLIPS)  # both images from afar agree
+    n_near = len(network.seen) - len(FLIPS)  # without the passes over the wide images
     assert sum(image.shape == network.seen[0].shape for image in network.seen) == len(FLIPS)
-    assert (n_near > 2 + len(FLIPS)) == (rival_mm == 30.0)  # a place, the same once more, and that with mirror images
+    assert (n_near > 2 + len(FLIPS)) == (rival_mm == 30.0)  # one place, a second time and mirrored
 
 
 def test_mirror_images_that_disagree_are_not_all() -> None:

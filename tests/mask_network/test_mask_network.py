@@ -41,7 +41,7 @@ def test_normalised_is_safe_for_black_images() -> None:
     image = torch.rand(1, 1, 20, 20, 10)
     image[..., 0, 0, 0] = 1e6  # one hot pixel
     assert 0.4 < float(normalised(image).mean()) < 0.6
-    torch.testing.assert_close(normalised(1e-9 * image), normalised(image))  # in any units
+    torch.testing.assert_close(normalised(1e-9 * image), normalised(image))  # independent of units
 
 
 @pytest.mark.parametrize("factor", [(2, 2, 1), (2, 2, 2)])

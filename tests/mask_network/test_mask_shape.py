@@ -1,4 +1,4 @@
-"""From the pixels that a network calls brain to the outline that a person would draw."""
+"""Mask shape: from the pixels that a network calls brain to an outline like a hand-drawn one."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ SPACING_MM = np.array([0.8, 1.1, 3.0])
 
 def test_parts_of_a_moving_head_stay_and_holes_are_filled() -> None:
     mask = np.zeros((60, 60, 6), dtype=bool)
-    for k in range(6):  # a head that jumps sideways half way
+    for k in range(6):  # a head that jumps sideways at mid-stack
         shift = 0 if k < 3 else 12
         mask[10 + shift : 25 + shift, 10:30, k] = True
     holes = mask.copy()
     holes[15, 15, 1] = False
-    holes[50:53, 50:53, 2] = True  # far off
+    holes[50:53, 50:53, 2] = True  # far away
     np.testing.assert_array_equal(cleaned(holes, np.array([1.0, 1.0, 4.0])), mask)
     assert not cleaned(np.zeros((4, 4, 4), dtype=bool), np.ones(3)).any()
 
@@ -56,7 +56,7 @@ def test_an_ellipsoid_stays_whole_and_what_sticks_out_goes() -> None:
     probability = np.where(head, 0.9, 0.7)
     np.testing.assert_array_equal(without_outgrowths(head, probability, SPACING_MM), head)
     face = head.copy()
-    face[55:70, 45:60, 36:] = True  # from 10 mm below the head's end on
+    face[55:70, 45:60, 36:] = True  # starts 10 mm below the head's end
     face &= ~head
     left = without_outgrowths(head | face, probability, SPACING_MM)
     assert (left & head).sum() == head.sum()
@@ -89,5 +89,5 @@ def test_clefts_of_a_section_are_filled_and_wide_bays_stay(at_edge: bool) -> Non
     bay[20:80, 10:60, 1] = False  # 48 mm
     assert (without_clefts(cleft, SPACING_MM) ^ whole).sum() < 10  # the disc leaves a dent at the mouth
     filled = without_clefts(bay, SPACING_MM) & ~bay
-    assert filled.sum() < 0.1 * (whole & ~bay).sum()  # the disc does not reach into its corners
+    assert filled.sum() < 0.1 * (whole & ~bay).sum()  # the closing disc does not reach into the corners of the bay
     np.testing.assert_array_equal(without_clefts(whole, SPACING_MM), whole)

@@ -1,4 +1,4 @@
-"""The weights that are shipped find a head among all that surrounds it, and outline it."""
+"""The shipped weights find a head in its surroundings and outline it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from data_synth.mask_samples import full_stack
 from data_synth.mask_scans import draw_scan
 
 SEED = 3
-"""Of an ordinary scan: it holds the whole head, in a uterus; `studies/masks` has the bad ones."""
+"""Seed of an ordinary scan that shows the whole head in a uterus; `studies/masks` has difficult ones."""
 
 PIXEL_MM = 1.2
 

@@ -1,4 +1,4 @@
-"""A user's masker: run once for each stack, its mask checked; failing, hanging and lying ones are refused."""
+"""The user's mask command: run once per stack, its masks checked, failing or hanging ones refused."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ nibabel.save(nibabel.Nifti1Image(inside.astype(numpy.uint8), image.affine), sys.
 @pytest.fixture
 def stack(tmp_path: Path) -> Path:
     data = np.arange(8 * 8 * 4, dtype=np.float32).reshape(8, 8, 4) % 10
-    path = tmp_path / "a stack {mask}.nii.gz"  # with a space and a place's name in it
+    path = tmp_path / "a stack {mask}.nii.gz"  # the name has a space and a placeholder
     nib.save(nib.Nifti1Image(data, AFFINE), path)
     return path
 
@@ -94,7 +94,7 @@ def test_what_it_does_wrong_is_said(program: str, says: str, stack: Path, tmp_pa
     "program",
     [
         "import time; time.sleep(60)",
-        # its child keeps the pipe open after it has ended
+        # its child process keeps the pipe open after the command has ended
         "import subprocess, sys; subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])",
     ],
     ids=["itself", "its child"],

@@ -1,4 +1,4 @@
-"""Masks given, masks found, and stacks that are left out."""
+"""Given masks, found masks, and stacks that are left out."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write(folder: Path, name: str, around: float = 1.0) -> Path:
 
 
 def find(paths: list[Path], masks: dict[str, np.ndarray | str], given: list[Path | None] | None = None) -> MaskedStacks:
-    """With a masker that looks masks up by the name of the stack."""
+    """Find masks with a mask command that looks them up by the name of the stack."""
 
     def masker(path: object, volume: Volume) -> FoundMask | str:
         found = masks[volume.name]
@@ -68,7 +68,7 @@ def test_a_stack_without_a_head_is_left_out_with_the_reason(three: list[Path]) -
 
 
 def test_stacks_of_one_name_are_told_apart_and_keep_their_numbers(tmp_path: Path) -> None:
-    """From the sentence on one that is left out to the names of those that are used."""
+    """This holds for the message about a stack that is left out and for the names of used stacks."""
     paths = []
     for n, folder in enumerate("abc"):
         (tmp_path / folder).mkdir()

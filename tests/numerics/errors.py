@@ -1,4 +1,4 @@
-"""Errors of the renderer and its gradients, swept over orders of magnitude: the rows of docs/numerics.md."""
+"""Errors of the renderer and its gradients over orders of magnitude: the rows of docs/numerics.md."""
 
 from __future__ import annotations
 
@@ -28,33 +28,33 @@ SIGMAS_PER_PIXEL = (0.02, 0.1, 0.2, 0.3, 0.5, 0.8, 1.5)
 DISTANCES_M = (0.0, 1.0, 10.0, 100.0)
 
 FULL_CUTOFF = 6.0
-"""Where the errors below are those of arithmetic: what is cut off is 1.5e-8 of a amplitude."""
+"""Cut-off at which the errors below are purely arithmetic: it removes 1.5e-8 of an amplitude."""
 
 Row = dict[str, float]
 
 
 def shape_tolerance(ratio: float) -> float:
-    """Largest error over the largest pixel that float32 may make at an axis ratio.
+    """Tolerance of float32 pixels at an axis ratio: largest error relative to the largest pixel.
 
-    2e-6 for the polynomial exponential (2e-7), rounded parameters of a record and sums; and eps times the
-    ratio: a position along the long axis is rounded to eps of its length, and a slanted Gaussian turns that
-    into the direction of the short axis, where it counts in units of the shortest sigma.
+    It is 2e-6 for the polynomial exponential (2e-7), the rounded parameters and the sums, plus eps times the
+    ratio: a position along the long axis is rounded to eps of its length, and for a slanted Gaussian this error
+    has a component along the short axis, where it counts in units of the shortest sigma.
     """
     return 2e-6 + EPS32 * ratio
 
 
 def gradient_tolerance(ratio: float) -> float:
-    """Largest relative error of a gradient that float32 may make at an axis ratio.
+    """Tolerance of float32 gradients at an axis ratio: largest relative error.
 
-    2e-4 because sums of random weights cancel: the gradient in shape is a difference of second and zeroth
-    moments, each good to 2e-6, that is up to a hundred times smaller than they are. And 8 eps times the
-    ratio: the moments of a slanted Gaussian are taken along the plane's axes, as in `shape_tolerance`.
+    It is 2e-4 because sums of random weights cancel: the gradient in shape is a difference of second and zeroth
+    moments with errors of 2e-6, and is up to a hundred times smaller than the moments. To this is added 8 eps times the
+    ratio, because the moments of a slanted Gaussian are taken along the plane's axes, as in `shape_tolerance`.
     """
     return 2e-4 + 8 * EPS32 * ratio
 
 
 def shape_rows(ratios: tuple[float, ...] = RATIOS) -> list[Row]:
-    """Error of values by axis ratio, for V(x) and for slices, of every way of computing them."""
+    """Error of values by axis ratio, for V(x) and for slices, for every method of computation."""
     return _largest_by_ratio(value_errors, ratios)
 
 
@@ -76,9 +76,9 @@ def _largest_by_ratio(errors: Callable[[Scene], Row], ratios: tuple[float, ...])
 
 
 def value_errors(scene: Scene) -> Row:
-    """Largest error over the largest pixel of one scene: of float64 by integration, of the others by float64.
+    """Largest error of one scene over its largest pixel: float64 against integration, the others against float64.
 
-    inf where a value is not finite.
+    The error is inf if a value is not finite.
     """
     cloud, planes = scene.cloud, scene.planes
     exact = render(cloud, planes, backend="reference").numpy()
@@ -99,7 +99,7 @@ def value_errors(scene: Scene) -> Row:
 
 
 def relative_error(found: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
-    """Largest difference over the largest exact value; inf where something is not finite."""
+    """Largest difference relative to the largest exact value; inf if a value is not finite."""
     found = found.astype(np.float64)
     if not np.isfinite(found).all():
         return math.inf
@@ -111,9 +111,9 @@ def relative_error(found: NDArray[np.floating], exact: NDArray[np.floating]) -> 
 def gradients(
     cloud: GaussianCloud, planes: Planes, weight: Tensor, dtype: torch.dtype, **options: float | str
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Pixels, and the gradients of their weighted sum in everything that has one, in float64.
+    """Pixels, and the gradients of their weighted sum in all parameters, in float64.
 
-    Log-scales and quaternions are one entry, `shape`: of a round Gaussian the latter is zero.
+    Log-scales and quaternions are one entry, `shape`, because the quaternion of a round Gaussian has gradient zero.
     """
     leaves = [p.detach().to(dtype).requires_grad_() for p in cloud.parameters]
     further = [torch.zeros(len(planes), n, dtype=dtype, requires_grad=True) for n in (6, 1)]
@@ -142,7 +142,7 @@ def gradients(
 
 
 def gradient_errors(scene: Scene, seed: int = 0) -> Row:
-    """Norm of the error over the norm of each gradient of random weights; inf where one is not finite."""
+    """Norm of the error relative to the norm of each gradient for random weights; inf if a gradient is not finite."""
     weight = torch.tensor(np.random.default_rng(seed).normal(size=scene.planes.n_pixels))
     _, exact = gradients(scene.cloud, scene.planes, weight, torch.float64, backend="reference")
     _, found = gradients(scene.cloud, scene.planes, weight, torch.float32, cutoff_sigma=FULL_CUTOFF)
@@ -159,9 +159,9 @@ def gradient_errors(scene: Scene, seed: int = 0) -> Row:
 def size_rows(
     sigmas_mm: tuple[float, ...] = SIGMAS_MM, thicknesses_mm: tuple[float, ...] = THICKNESSES_MM
 ) -> list[Row]:
-    """Error of numba's values by size of nearly round Gaussians and thickness of slices (0: V(x)).
+    """Error of numba's values by size of nearly round Gaussians and slice thickness (0: V(x)).
 
-    Beside it, V(x) with 1e-8 mm^6 added to determinants: an absolute epsilon has a hidden unit.
+    For comparison, V(x) with 1e-8 mm^6 added to determinants, to show that an absolute epsilon has a hidden unit.
     """
     rows = []
     for sigma in sigmas_mm:
@@ -186,7 +186,7 @@ def size_rows(
 
 
 def sized_scenes(sigma_mm: float, thickness_mm: float, n: int = 6, seed: int = 1) -> list[Scene]:
-    """Gaussians of about one size on planes of about their size; a thickness of zero is no PSF."""
+    """Gaussians of similar size on planes of similar size; a thickness of zero means no PSF."""
     rng = np.random.default_rng(seed)
     scenes = []
     for _ in range(n):
@@ -208,20 +208,20 @@ def sized_scenes(sigma_mm: float, thickness_mm: float, n: int = 6, seed: int = 1
 
 
 def comb(sigma: float, phase: float) -> float:
-    """Sum over whole n of a unit Gaussian of a sigma at n - phase: 1 where samples tell its integral.
+    """Sum over integers n of a unit Gaussian of a sigma at n - phase; 1 if samples give its integral exactly.
 
-    By Poisson's formula 1 + 2 sum_m exp(-2 pi^2 sigma^2 m^2) cos(2 pi m phase); summed as it stands, which
-    converges at any sigma.
+    By Poisson's formula it is 1 + 2 sum_m exp(-2 pi^2 sigma^2 m^2) cos(2 pi m phase). It is summed directly, which
+    converges for any sigma.
     """
     n = np.arange(-math.ceil(8 * sigma) - 2, math.ceil(8 * sigma) + 3)
     return float(np.exp(-0.5 * ((n - phase) / sigma) ** 2).sum() / (sigma * math.sqrt(2 * math.pi)))
 
 
 def pixel_rows(sigmas: tuple[float, ...] = SIGMAS_PER_PIXEL, n_places: int = 40) -> list[Row]:
-    """Mass of a Gaussian that samples show, over its true mass, by sigma over pixel: aliasing.
+    """Aliasing: ratio of a Gaussian's mass in samples to its true mass, by sigma in pixels.
 
-    In the voxels of a volume, and in one gapless stack of slices with their PSF (there the pixel is that of
-    the slice; slices of 2.2 mm). Least and most over random places, and most and least by the formula.
+    It is given for the voxels of a volume and for one gapless stack of slices with PSF (where the pixel is that of
+    the slice; slices of 2.2 mm): minimum and maximum over random positions, and maximum and minimum by the formula.
     """
     rng = np.random.default_rng(2)
     rows = []
@@ -239,7 +239,7 @@ def pixel_rows(sigmas: tuple[float, ...] = SIGMAS_PER_PIXEL, n_places: int = 40)
             planes = replace(planes, psf_var_mm2=np.tile(variance, (len(planes), 1)))
             steps = np.array([PIXEL_MM, PIXEL_MM, step_mm])
             seen = []
-            # the worst places are on a sample and between samples, in every axis
+            # the extreme positions are on a sample and midway between samples, along every axis
             places = np.concatenate([[[0.0, 0, 0], [0.5, 0.5, 0.5]], rng.uniform(-0.5, 0.5, (n_places, 3))])
             for place in places:
                 cloud = cloud_of(
@@ -260,7 +260,7 @@ def pixel_rows(sigmas: tuple[float, ...] = SIGMAS_PER_PIXEL, n_places: int = 40)
 
 
 def distance_rows(distances_m: tuple[float, ...] = DISTANCES_M) -> list[Row]:
-    """Error of values by distance of the scene from the world's origin: with a local origin and without."""
+    """Error of values by distance of the scene from the world's origin, with and without a local origin."""
     rows = []
     for distance in distances_m:
         origin = np.array([1.0, -1.0, 1.0]) * distance * 1000 / math.sqrt(3)

@@ -1,4 +1,4 @@
-"""Every way that g3r has of rendering and differentiating a cloud, under one signature."""
+"""All backends of g3r that render and differentiate a cloud, under one signature."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def numba(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
 
 
 def objective(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
-    """The kernel of the fits: with targets far away on one side, L1 is a weighted sum and a constant."""
+    """The kernel of the fits: with targets far away on one side, L1 is a weighted sum plus a constant."""
     sign, size = weight.sign().numpy(), weight.abs().numpy()
     far = 10 * float(cloud.amplitude.abs().sum()) + 1
     parameters = FitParameters(single(cloud), LearningRates())

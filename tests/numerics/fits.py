@@ -1,4 +1,4 @@
-"""Whole reconstructions of a small head under changes that change nothing, and fits that go astray."""
+"""Reconstructions of a small head under changes that should have no effect, and diverging fits."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ SETTINGS = replace(
         template=False, network=False, stacks=False, segments=False, n_rounds=2, standard_orientation=False
     ),
 )
-"""The shortest preset, with slices registered from where the header has them: no search, no mean head."""
+"""The shortest preset, with slices registered from their header poses: no search, no template."""
 
 
 def small_stacks(factor: float = 1.0, motion: RigidPose | None = None) -> list[Stack]:
-    """Three stacks of one small head, intensities times a factor, the whole world after a rigid motion.
+    """Three stacks of one small head with scaled intensities, after a rigid motion of the whole world.
 
-    Pixels are those of the unmoved world, bit for bit: only headers move.
+    Pixels are bit-identical to those of the unmoved world, since only headers move.
     """
     scene = head_scene()
     noise = np.random.default_rng(3).normal(0, NOISE, scene.planes.n_pixels)
@@ -78,7 +78,7 @@ def _stack(planes: Planes, pixels: NDArray[np.float32], inside: NDArray[np.bool_
 
 
 def reconstruction(factor: float = 1.0, motion: RigidPose | None = None) -> ReconstructionResult:
-    """The whole pipeline on the small head."""
+    """Reconstruction of the small head by the whole pipeline."""
     return GaussianReconstructor(settings=SETTINGS).reconstruct(small_stacks(factor, motion))
 
 
@@ -93,10 +93,10 @@ CHANGES: dict[str, tuple[float, RigidPose | None]] = {
 
 
 def volume_changes() -> list[dict[str, Any]]:
-    """For each change: how far the head is from that of the plain reconstruction, over its 99th percentile.
+    """Differences of the head to the plain reconstruction for each change, relative to the 99th percentile.
 
-    Both clouds are rendered at the same points of the head, which move with the world. Beside it stands the
-    mean error against the truth, before and after: what a change of the result means.
+    Both clouds are rendered at the same points of the head, which move with the world. For comparison, rows have the
+    mean error against the truth before and after.
     """
     plain = reconstruction()
     points = _points(plain)
@@ -116,7 +116,7 @@ def volume_changes() -> list[dict[str, Any]]:
 
 
 def _points(result: ReconstructionResult) -> Planes:
-    """Planes of single pixels at the voxels of the head, well inside."""
+    """Planes of single pixels at voxels well inside the head."""
     world = result.grid.world(np.argwhere(result.mask))
     world = world[np.linalg.norm(world - ORIGIN_MM, axis=1) < HEAD_RADIUS_MM - 2][::7]
     n = len(world)
@@ -141,7 +141,7 @@ def times(factor: float) -> LearningRates:
 
 
 def slices_of_small_head(noise: float = NOISE) -> tuple[Slices, VolumeGrid, NDArray[np.float32], NDArray[np.bool_]]:
-    """Slices of the small head about the origin, and a blurred guess of it with mask on a grid."""
+    """Slices of the small head about the origin, and a blurred version of it with mask on a grid."""
     scene = head_scene(np.zeros(3))
     planes = stacks_of_planes(np.zeros(3))
     rng = np.random.default_rng(4)
@@ -165,7 +165,7 @@ def slices_of_small_head(noise: float = NOISE) -> tuple[Slices, VolumeGrid, NDAr
 
 
 def fit_at(factor: float, guarded: bool = True, n_steps: int = 60) -> SliceFit:
-    """A slice fit with all step sizes times a factor, with or without the safeguard."""
+    """A slice fit with all step sizes times a factor, with or without the divergence guard."""
     slices, grid, guess, mask = slices_of_small_head()
     ones = np.ones(len(slices))
     settings = SliceStageSettings(n_steps=n_steps, rates=times(factor))
@@ -187,7 +187,7 @@ def fit_at(factor: float, guarded: bool = True, n_steps: int = 60) -> SliceFit:
 
 
 def step_size_rows() -> list[dict[str, float]]:
-    """How fits end whose step sizes are too large, with and without going back."""
+    """Final errors of fits with too large step sizes, with and without rollbacks."""
     rows = []
     for factor in (1.0, 10.0, 100.0):
         for guarded in (True, False):

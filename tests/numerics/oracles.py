@@ -1,4 +1,4 @@
-"""Oracles of the numerics suite, by integration and in float64, and the naive formulas that they expose."""
+"""Oracles of the numerics suite, by integration and in float64, and naive formulas for comparison."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from g3r.gaussians import GaussianCloud
 from g3r.geometry.quaternion import rotation_from_quaternion
 
 REACH = 6.5
-"""Sigmas out to which integrals go; what lies beyond is 1e-10 of the whole."""
+"""Limit of integrals in sigmas; the rest beyond is 1e-10 of the whole."""
 
 STEP = 0.5
-"""Distance of nodes over the narrowest sigma of the integrand."""
+"""Node spacing relative to the narrowest sigma of the integrand."""
 
 
 def volume_at(cloud: GaussianCloud, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V(x) of Eq. 3 at world points [P, 3]: turned into a Gaussian's axes, divided by sigma, no inverse."""
+    """V(x) of Eq. 3 at world points [P, 3]: rotated into a Gaussian's axes and divided by sigma, without an inverse."""
     mean, log_scale, quaternion, amplitude = (p.detach().double() for p in cloud.parameters)
     axes = rotation_from_quaternion(quaternion).numpy()
     total = np.zeros(len(points_mm))
@@ -32,13 +32,13 @@ def volume_at(cloud: GaussianCloud, points_mm: NDArray[np.float64]) -> NDArray[n
 def integrated_pixels(cloud: GaussianCloud, planes: Planes) -> NDArray[np.float64]:
     """Eq. 2 by quadrature: the integral of V times the PSF at every pixel, for Gaussians of any shape.
 
-    The nodes stand in each Gaussian's own axes, where V is a product: half of the integrand's narrowest sigma
-    apart, from -6.5 to 6.5 sigma of the Gaussian or of the PSF, whichever ends first. Equidistant nodes
-    converge exponentially for Gaussians: half a sigma apart, the error is 2 exp(-8 pi^2), beyond float64.
+    The nodes lie along each Gaussian's own axes, where V is a product, with a spacing of half the integrand's narrowest
+    sigma, from -6.5 to 6.5 sigma of the Gaussian or of the PSF, whichever ends first. Equidistant nodes
+    converge exponentially for Gaussians: at half a sigma the error is 2 exp(-8 pi^2), beyond float64.
     No closed form of a product of Gaussians is used.
 
     Raises:
-        ValueError: a plane without PSF, where there is nothing to integrate.
+        ValueError: a plane without PSF, which needs no integration.
     """
     if len(planes) and not planes.psf_var_mm2.min() > 0:
         raise ValueError("a plane without PSF samples V(x); use volume_at")
@@ -73,9 +73,9 @@ def integrated_pixels(cloud: GaussianCloud, planes: Planes) -> NDArray[np.float6
 
 
 def naive_render(cloud: GaussianCloud, planes: Planes, dtype: torch.dtype, epsilon: float = 0.0) -> Tensor:
-    """The formula as it is usually written: S as a product, determinant, adjugate over it, in one dtype.
+    """The formula as usually written: S as a product, inverse as adjugate over determinant, in one dtype.
 
-    With an epsilon (mm^6) added to the determinant, as some codes have it. Kept to show where it fails.
+    An epsilon (mm^6) is added to the determinant, as in some codes. It serves to show where this fails.
     """
     mean, log_scale, quaternion, amplitude = (p.detach().to(dtype) for p in cloud.parameters)
     root = rotation_from_quaternion(quaternion) * log_scale.exp()[:, None]
@@ -97,7 +97,7 @@ def naive_render(cloud: GaussianCloud, planes: Planes, dtype: torch.dtype, epsil
 
 
 def absolute(cloud: GaussianCloud, dtype: torch.dtype) -> GaussianCloud:
-    """The cloud with world coordinates in one dtype and no origin of its own, as is usual."""
+    """The cloud with world coordinates in one dtype and without a local origin, as usual elsewhere."""
     mean = (cloud.mean_mm.double() + torch.from_numpy(cloud.origin_mm)).to(dtype)
     rest = [p.to(dtype) for p in cloud.parameters[1:]]
     return GaussianCloud.of([mean, rest[0], rest[1], rest[2]], np.zeros(3))

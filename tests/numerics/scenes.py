@@ -1,4 +1,4 @@
-"""Scenes of the numerics suite: Gaussians of extreme shapes, and planes on which they are hardest."""
+"""Scenes of the numerics suite: Gaussians of extreme shapes, on the most difficult planes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def cloud_of(
     amplitude: NDArray[np.float64],
     origin_mm: NDArray[np.float64] = ORIGIN_MM,
 ) -> GaussianCloud:
-    """A float64 cloud of parameters that float32 holds exactly: errors are the arithmetic's alone."""
+    """A float64 cloud with parameters that float32 represents exactly, so that errors come from arithmetic alone."""
     arrays = (mean_mm, np.log(sigma_mm), quaternion_wxyz, amplitude)
     return GaussianCloud.of([torch.tensor(array, dtype=torch.float32).double() for array in arrays], origin_mm)
 
@@ -45,13 +45,13 @@ def cloud_of(
 def slender_scenes(ratio: float, widest_mm: float, psf: bool, n: int = 12, seed: int = 0) -> list[Scene]:
     """Single Gaussians of one axis ratio, each on three planes.
 
-    Two planes nearly hold the longest and the shortest axis, tilted by about the angle that matters, with
-    pixels of half the shortest sigma one way and an eighth of the longest the other; one lies at random.
+    Two planes nearly contain the longest and the shortest axis, tilted by about the critical angle, with
+    pixels of half the shortest sigma along one axis and an eighth of the longest along the other; one plane is random.
 
     Args:
         ratio: longest over shortest sigma; the third is between them.
-        widest_mm: the longest.
-        psf: whether the planes have the PSF of slices, or none.
+        widest_mm: the longest sigma.
+        psf: whether the planes have the PSF of slices or no PSF.
         n: number of scenes.
         seed: of everything random.
     """
@@ -94,7 +94,7 @@ def head_scene(origin_mm: NDArray[np.float64] = ORIGIN_MM, n: int = 60, seed: in
 def stacks_of_planes(
     origin_mm: NDArray[np.float64], thickness_mm: float = THICKNESS_MM, n_slices: int = 10, n_pixels: int = 28
 ) -> Planes:
-    """Three stacks of parallel slices across each other, in pixels of 0.8 mm."""
+    """Three crossing stacks of parallel slices with pixels of 0.8 mm."""
     frames = [np.eye(3), *Rotation.from_euler("xy", [[90, 0], [0, 90]], degrees=True).as_matrix()]
     rotation = np.repeat(frames, n_slices, axis=0)
     offset = np.tile((np.arange(n_slices) - (n_slices - 1) / 2) * thickness_mm, 3)

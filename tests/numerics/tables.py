@@ -1,4 +1,4 @@
-"""`python -m tests.numerics.tables`: errors at the extremes, as the tables of docs/numerics.md."""
+"""`python -m tests.numerics.tables`: errors at extreme values, as the tables of docs/numerics.md."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, default=Path("runs") / "studies" / "numerics")
     parser.add_argument("--only", choices=TABLES, nargs="+", help="some of the tables (None: all)")
     options = parser.parse_args(argv)
-    logging.getLogger("g3r.fitting.divergence_guard").setLevel(logging.ERROR)  # its table says it
+    logging.getLogger("g3r.fitting.divergence_guard").setLevel(logging.ERROR)  # the table shows the rollbacks
     record: dict[str, Any] = {"machine": machine(), "tables": {}}
     try:
         for name in options.only or TABLES:
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def shown(value: float) -> str:
-    """Two digits; what is not finite in words."""
+    """A number with two digits, or in words if it is not finite."""
     return f"{value:.1e}" if math.isfinite(value) else "not finite"
 
 
@@ -94,7 +94,7 @@ def size_table(rows: Rows) -> str:
 
 
 def pixel_table(rows: Rows) -> str:
-    """Mass that samples show, by sigma over pixel."""
+    """Mass of a Gaussian in samples, by sigma in pixels."""
 
     def pair(row: Mapping[str, Any], name: str, low: str, high: str) -> str:
         return f"{row[f'{name} {low}']:.3g} to {row[f'{name} {high}']:.3g}"
@@ -124,7 +124,7 @@ def distance_table(rows: Rows) -> str:
 
 
 def change_table(rows: Rows) -> str:
-    """What whole reconstructions make of changes that ought to change nothing."""
+    """Effect on whole reconstructions of changes that should have none."""
     return markdown_table(
         ["change of the input", "mean change", "largest change", "mean error against the truth"],
         [[row["change"], *(shown(row[name]) for name in ("mean", "largest")), f"{row['error']:.4f}"] for row in rows],
@@ -132,7 +132,7 @@ def change_table(rows: Rows) -> str:
 
 
 def step_table(rows: Rows) -> str:
-    """Fits whose step sizes are too large."""
+    """Fits with too large step sizes."""
 
     def number(value: float) -> str:
         return f"{value:.4f}" if math.isfinite(value) else "no result"

@@ -1,4 +1,4 @@
-"""Amplitudes where they are not determined, densities from nothing to a million, and where naive formulas fail."""
+"""Undetermined amplitudes, densities from zero to a million, and failures of naive formulas."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.tally import Tally
 
 
 def copies(n: int) -> tuple[GaussianCloud, GaussianCloud]:
-    """A cloud, and one in which every Gaussian stands n times: rank one n-th of its size."""
+    """A cloud, and the same with n copies of every Gaussian, so that the rank is one n-th of the size."""
     cloud = single(head_scene().cloud)
     return cloud, cloud.take(torch.arange(len(cloud)).repeat(n))
 
@@ -30,7 +30,7 @@ def copies(n: int) -> tuple[GaussianCloud, GaussianCloud]:
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_identical_gaussians_share_the_peak(n: int, damping: float, tally: Tally) -> None:
-    """Of all least-squares solutions conjugate gradients from zero take the shortest: equal shares."""
+    """Conjugate gradients from zero give the least-squares solution of smallest norm: equal shares."""
     planes = head_scene().planes
     cloud, several = copies(n)
     target, ones = render(cloud, planes).numpy(), np.ones(planes.n_pixels, np.float32)
@@ -87,7 +87,7 @@ def test_weights_of_any_size(factor: float, tally: Tally) -> None:
 
 
 def test_an_epsilon_in_the_denominator_of_peaks_has_a_hidden_unit() -> None:
-    """Sums over a narrow Gaussian are small: the epsilon decides the naive amplitude, and ours does not move."""
+    """Sums over a narrow Gaussian are small, so the epsilon dominates the naive amplitude but not ours."""
     cloud = GaussianCloud.of(
         [torch.zeros(1, 3), torch.full((1, 3), float(np.log(0.02))), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1)],
         head_scene().cloud.origin_mm,
@@ -99,7 +99,7 @@ def test_an_epsilon_in_the_denominator_of_peaks_has_a_hidden_unit() -> None:
     target = np.full(planes.n_pixels, 1.0, np.float32)
     naive = [float(naive_amplitudes(matrix, target, epsilon)[0]) for epsilon in (0.0, 1e-8, 1e-4)]
     assert naive[0] == pytest.approx(1.0)
-    assert naive[2] < 0.6  # an epsilon that harms no other Gaussian
+    assert naive[2] < 0.6  # an epsilon that affects no other Gaussian
     start = cloud.with_amplitude(torch.zeros(1))
     found = [
         solve_amplitudes(start, planes, shown * factor, np.full(planes.n_pixels, weight, np.float32), damping=0.0)
@@ -110,7 +110,7 @@ def test_an_epsilon_in_the_denominator_of_peaks_has_a_hidden_unit() -> None:
 
 
 def test_determinant_and_inverse_fail_where_the_renderer_does_not() -> None:
-    """The formula as it is usually written, in float32: 0.3 % wrong at a ratio of 100, no number at 1000."""
+    """The usual formula in float32 has an error of 0.3 % at a ratio of 100 and gives no number at 1000."""
     errors: dict[tuple[str, float], float] = {}
     for ratio in (100.0, 1000.0):
         for scene in slender_scenes(ratio, 20.0, False, 6):
@@ -143,7 +143,7 @@ def test_the_gate_at_every_density(dtype: torch.dtype, tally: Tally) -> None:
             value, m_grad = value.detach(), gradient_of(m)
             assert torch.isfinite(value).all()
             assert torch.isfinite(m_grad).all()
-            # alpha and beta themselves are rounded in half precision
+            # alpha and beta are themselves rounded to half precision
             slack = float(torch.finfo(dtype).eps)
             assert gate.alpha - slack <= float(value) <= gate.beta + slack
             assert -1 <= float(m_grad) <= 0
@@ -176,7 +176,7 @@ def test_the_prior_network_at_every_density(density: float, tally: Tally) -> Non
 
 @pytest.mark.parametrize("factor", [0.0, 1e-30, 1e-6, 1.0, 1e6])
 def test_density_and_coarse_volume_at_any_trust(factor: float, tally: Tally) -> None:
-    """V_coarse is a mean: the size of the weights falls out, down to where nothing counts as measured."""
+    """V_coarse is a mean, so the scale of the weights cancels, down to where a voxel counts as not measured."""
     from tests.numerics.fits import slices_of_small_head
 
     slices, grid, *_ = slices_of_small_head(noise=0.0)

@@ -1,4 +1,4 @@
-"""Registration of slices that say little about their poses: it ends near where it began, in numbers."""
+"""Registration of slices that hardly determine their poses: it ends near its start, with finite numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes at the edges of what may come: every backend gives finite values and gradients, and right ones."""
+"""Extreme scenes: every backend gives finite and correct values and gradients."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def identical() -> Scene:
 
 
 def flat(psf: bool, n: int = 6, tilt_rad: float = 3e-4, aside_mm: float = 0.01) -> Scene:
-    """Discs of 100 mm that are 0.02 mm thick, each in a plane nearly parallel to it and a little aside."""
+    """Discs of 100 mm that are 0.02 mm thick, each with a nearly parallel plane at a small distance."""
     rng = np.random.default_rng(5)
     turns = Rotation.random(n, rng=rng)
     cloud = cloud_of(
@@ -85,13 +85,13 @@ def flat(psf: bool, n: int = 6, tilt_rad: float = 3e-4, aside_mm: float = 0.01) 
 
 
 def apart(distance_mm: float) -> Scene:
-    """Planes that meet no Gaussian, so far from them."""
+    """Planes so far away that they meet no Gaussian."""
     scene, motion = head_scene(), RigidPose.from_rotvec([[0.0, 0, 0]], [[distance_mm, 0, 0]])
     return Scene(scene.cloud, scene.planes.moved(motion))
 
 
 def astray() -> Scene:
-    """Some Gaussians out of sight of every plane."""
+    """A scene in which some Gaussians are seen by no plane."""
     scene = head_scene()
     mean = scene.cloud.mean_mm.clone()
     mean[::3] += 5000.0
@@ -146,7 +146,7 @@ def test_value_and_every_gradient_are_finite_and_right(name: str, tally: Tally) 
             if backend != "reference64":
                 found, gradient = BACKENDS[backend](cloud, planes, weight)
             if len(found):
-                # what nearly misses the planes is cut off at 6 sigma: 1.5e-8 of each amplitude
+                # Gaussians that nearly miss the planes are cut off at 6 sigma: 1.5e-8 of each amplitude
                 bound = shape_tolerance(ratio) * max(largest, 1e-6 * height) + 2e-8 * height
                 assert float((found - expected).abs().max()) <= bound, backend
             for what, g in gradient.items():
@@ -173,13 +173,13 @@ def test_turns_of_the_twist_of_any_size(angle: float, tally: Tally) -> None:
             (pixels * weight.to(pixels.dtype)).sum().backward()
             assert torch.isfinite(gradient_of(leaf)).all()
             grads[backend] = gradient_of(leaf).double()
-    # float32 cannot hold an angle of pi: the pose itself is off by 1e-7 rad, over 20 mm
+    # float32 cannot represent pi, so the pose itself is off by 1e-7 rad, over 20 mm
     assert (grads["numba"] - grads["reference"]).norm() < 1e-4 * grads["reference"].norm()
 
 
 @pytest.mark.numerics
 def test_a_million_gaussians(tally: Tally) -> None:
-    """Against the same Gaussians in a hundred parts: sums of images, and of their gradients."""
+    """The reference is the sum of images and gradients of the same Gaussians in a hundred parts."""
     n = 1_000_000
     rng = np.random.default_rng(6)
     cloud = cloud_of(
@@ -209,7 +209,7 @@ def test_a_million_gaussians(tally: Tally) -> None:
 
 @pytest.mark.parametrize("sigma_mm", [1e-3, 0.05, 1.0, 50.0])
 def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally: Tally) -> None:
-    """y - V(x) = (D : Hessian of V) / 2 + ..., so it falls with the square of the PSF's width."""
+    """y - V(x) = (D : Hessian of V) / 2 + ..., so the difference falls with the square of the PSF's width."""
     scene = of_sigma(sigma_mm, 0.0)
     exact = volume_at(scene.cloud, scene.planes.pixel_world_mm())
     top = np.abs(exact).max()
@@ -218,7 +218,7 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
         planes = replace(scene.planes, psf_var_mm2=np.full((3, 3), (width * sigma_mm) ** 2))
         with tally.case():
             error = np.abs(render(scene.cloud, planes, backend="reference").numpy() - exact).max() / top
-            # the Hessian is at most 1 / (0.7 sigma)^2 in each axis; positions are good to 1e-14 mm
+            # the Hessian is at most 1 / (0.7 sigma)^2 along each axis; positions are exact to 1e-14 mm
             assert error <= 3 * width**2 + 1e-13 / sigma_mm + 1e-13
             assert error <= previous + 1e-13 / sigma_mm
             previous = error
@@ -227,7 +227,7 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
 
 
 def test_pairs_of_flat_gaussians_are_not_missed() -> None:
-    """In float32 the variance across a disc drowns in that along it; the search has to allow for that."""
+    """In float32 the variance across a disc is lost against that along it, which the search must allow for."""
     scene = flat(False, 40, 1e-5, 0.03)
     overlaps = find_overlaps(single(scene.cloud), scene.planes, 3.2)
     for k in range(len(scene.planes)):
@@ -237,7 +237,7 @@ def test_pairs_of_flat_gaussians_are_not_missed() -> None:
 
 
 def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair() -> None:
-    """Centres in float64, 10 m from the cloud's own origin."""
+    """The centres are in float64, 10 m from the cloud's local origin."""
     scene = head_scene()
     far = GaussianCloud.of([scene.cloud.mean_mm + 1e4, *scene.cloud.parameters[1:]], scene.cloud.origin_mm - 1e4)
     near, away = (find_overlaps(c, scene.planes, 3.2) for c in (scene.cloud, far))

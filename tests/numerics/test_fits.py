@@ -1,4 +1,4 @@
-"""Fits at the extremes: what is degenerate, what goes astray, and what ought to change nothing."""
+"""Extreme fits: degenerate input, divergence, and changes that should have no effect."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def with_mask(pixels: slice | list[int]) -> Slices:
 
 
 def turned_on_themselves() -> Slices:
-    """All slices of a stack in one place."""
+    """All slices of a stack at the same place."""
     slices = slices_of_small_head()[0]
     center = slices.planes.center_mm.copy()
     center[:] = center.mean(0)
@@ -135,7 +135,7 @@ def test_steps_that_are_too_large_are_taken_back(factor: float, tally: Tally, ca
         assert_finite(rash)
 
     def residual(result: SliceFit) -> float:
-        return result.history[-1]["image"]  # with gains, whose steps were too large as well
+        return result.history[-1]["image"]  # includes gains, whose steps were too large as well
 
     assert any("rollback" in entry for entry in rash.history)
     assert "back to the best state" in caplog.text
@@ -231,7 +231,7 @@ def test_a_small_rise_is_no_reason_to_go_back() -> None:
     parameters = one_gaussian()
     guard = DivergenceGuard(parameters, level=1.0)
     assert guard.step(0.010, 1.0)
-    assert guard.step(0.100, 1.0)  # ten times, but nothing beside the pixels
+    assert guard.step(0.100, 1.0)  # ten times larger, but negligible against the pixels
     assert guard.step(0.159, 1.0)
     guard.rescale(0.5)
     assert not guard.step(0.159, 1.0)
@@ -288,12 +288,12 @@ def test_the_table_of_changes_that_change_nothing(tally: Tally) -> None:
     for name, row in rows.items():
         with tally.case():
             if "2^" in name:
-                assert row["largest"] == 0, name  # scaling by a power of two is exact, to the last bit
+                assert row["largest"] == 0, name  # scaling by a power of two is exact
             elif "times" in name:
-                # rounding decides which voxels at the rim belong to the brain, and with them where Gaussians stand
+                # rounding decides which voxels at the rim belong to the brain, and so where Gaussians are placed
                 assert row["mean"] < 0.5 * plain, name
             elif "shifted" in name:
                 assert row["mean"] < 0.002, name
             elif "turned" in name:
-                assert row["mean"] < 1.5 * plain, name  # two fits with errors of their own
+                assert row["mean"] < 1.5 * plain, name  # two fits with independent errors
             assert abs(row["error"] - plain) < 0.25 * plain, name

@@ -1,8 +1,8 @@
 """The gradient of the complete slice-fitting loss against finite differences of the same loss in float64.
 
-The loss is written down here a second time, in float64 and without a gradient: pixels by the dense reference
-renderer, the terms of Eq. 9 one after the other. No pixel lies near the kink of |residual|: targets are moved
-away from what is rendered, so that central differences of 1e-5 stay on one side and are good to 1e-8.
+The loss is implemented here a second time, in float64 and without a gradient: pixels by the dense reference
+renderer, then the terms of Eq. 9. No pixel lies near the kink of |residual|: targets are moved
+away from the rendered values, so that central differences of 1e-5 stay on one side and are exact to 1e-8.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FRACTION = 0.5
 
 
 class CompleteLoss:
-    """Six Gaussians, six slices of three stacks, a prior; everything is fitted, nothing is at zero."""
+    """Six Gaussians, six slices of three stacks and a prior; all parameters are fitted, and none is zero."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -84,7 +84,7 @@ class CompleteLoss:
         self.loss = self.loss_with(SETTINGS)
 
     def loss_with(self, settings: SliceStageSettings) -> SliceLoss:
-        """The loss at the present parameters under some settings."""
+        """The loss at the current parameters with given settings."""
         loss = SliceLoss(
             self.parameters,
             self.slices,
@@ -94,7 +94,7 @@ class CompleteLoss:
             prior=self.prior,
             settings=settings,
         )
-        loss.objective.seed_log_scale[...] = self.seed  # the fit is under way
+        loss.objective.seed_log_scale[...] = self.seed  # as in the middle of a fit
         loss.draw(np.random.default_rng(self.draw_seed))
         return loss
 
@@ -130,7 +130,7 @@ class CompleteLoss:
         return pixels * gain * np.exp(field)
 
     def float64(self, value: dict[str, np.ndarray], frozen: float | None = None) -> float:
-        """The loss; `frozen` is the image term where it stands as a weight and has no gradient."""
+        """The loss; `frozen` is the image term where it serves as a weight without gradient."""
         weight = self.slices.mask * self.slice_weight[self.slices.planes.plane_id()]
         image = (weight * np.abs(self._shown(value) - self.slices.value)).sum() / weight.sum()
         frozen = image if frozen is None else frozen
@@ -189,7 +189,7 @@ def test_every_gradient_of_the_complete_loss_is_the_finite_difference(seed: int,
 
 
 def test_a_wrong_term_would_be_seen(tally: Tally) -> None:
-    """Each term, left out of the float64 loss, changes some gradient by far more than the tolerance."""
+    """Omitting any term from the float64 loss changes some gradient by far more than the tolerance."""
     complete = CompleteLoss(0)
     complete.loss.evaluate(FRACTION)
     changes: dict[str, dict[str, Any]] = {

@@ -1,4 +1,4 @@
-"""Mixed precision is for the networks alone: geometry, poses and images are never under autocast."""
+"""Mixed precision only in the networks: geometry, poses and images are never computed under autocast."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype,
 
 
 def test_a_renderer_under_autocast_would_be_wrong() -> None:
-    """The naive formula under the same autocast: why the reference switches it off."""
+    """The naive formula fails under the same autocast, which is why the reference switches it off."""
     from tests.numerics.oracles import naive_render
 
     scene = head_scene()
@@ -96,7 +96,7 @@ def moved_points_plainly(rotation: torch.Tensor, shift: torch.Tensor, points: to
 
 @pytest.mark.parametrize("density", [0.0, 1.0, 1e6])
 def test_the_prior_network_may_run_in_bfloat16_and_its_volume_stays_float32(density: float, tally: Tally) -> None:
-    """Rounding reaches the residual alone; where slices are dense the gate passes a twentieth of it."""
+    """Rounding affects only the residual, of which the gate passes a twentieth where slices are dense."""
     torch.manual_seed(0)
     config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False, use_template=False)
     network = DensityGatedPriorNetwork(config).eval()

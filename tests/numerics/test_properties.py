@@ -28,7 +28,7 @@ QUICK = settings(
 
 @st.composite
 def scenes(draw: st.DrawFn) -> tuple[Scene, float]:
-    """A scene of anything that may come, and its largest axis ratio."""
+    """A random scene, and its largest axis ratio."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n, n_planes = draw(st.integers(0, 12)), draw(st.integers(1, 4))
     low = draw(st.floats(-3.9, 4.6))  # ln mm: 0.02 to 100
@@ -67,7 +67,7 @@ def test_random_scenes_agree_with_the_reference(
             assert float((found - expected).abs().max()) <= shape_tolerance(ratio) * height + 2e-8 * height
         for name, g in gradient.items():
             assert torch.isfinite(g).all(), name
-        # the gradient in amplitudes is the image of one Gaussian against the weights: bounded by their sum
+        # the gradient in an amplitude is the product of one Gaussian's image with the weights, bounded by their sum
         total = float(weight.abs().sum())
         error = (gradient["amplitude"] - exact_gradient["amplitude"]).abs().max() if len(scene.cloud) else 0.0
         assert float(error) <= (shape_tolerance(ratio) + 2e-8) * total

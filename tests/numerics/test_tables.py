@@ -1,4 +1,4 @@
-"""The tables of docs/numerics.md: what they are made of keeps its bounds, and the document says the same."""
+"""The tables of docs/numerics.md: their figures are within bounds, and the document agrees with them."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def written(name: str) -> str:
 
 
 def assert_written(name: str, table: str, factor: float = 4.0) -> None:
-    """The document has the same words, and numbers within a factor (other machines round otherwise)."""
+    """Assert that the document has the same words, and numbers within a factor (rounding differs between machines)."""
     number = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
     found, expected = written(name), table.strip()
-    # the width of numbers does not count, nor whether one is there at all
+    # neither the width of numbers nor their presence matters
     assert number.sub("#", found) == number.sub("#", expected), name
     for a, b in zip(number.findall(found), number.findall(expected), strict=True):
         a, b = abs(float(a)), abs(float(b))
@@ -47,9 +47,9 @@ def test_values_by_axis_ratio(tally: Tally) -> None:
         with tally.case():
             for name in FLOAT32:
                 assert row[name] <= shape_tolerance(row["ratio"]), (name, row)
-            # quadrature out to 6.5 sigma; V(x) loses eps times the ratio, as any dtype does
+            # quadrature to 6.5 sigma; V(x) loses eps times the ratio in any dtype
             assert row["float64"] <= 2e-10 if row["psf"] else row["float64"] <= 1e-14 + 1e-15 * row["ratio"]
-        if row["ratio"] >= 1000:  # here the naive formulas fail
+        if row["ratio"] >= 1000:  # the naive formulas fail here
             assert not row["naive float32"] < 0.1
             assert not row["naive float32, epsilon"] < 0.1
     assert_written("shape", numerics.shape_table(rows))
@@ -72,7 +72,7 @@ def test_values_by_size_and_thickness(tally: Tally) -> None:
             if name not in ("sigma_mm", "epsilon"):
                 with tally.case():
                     assert error <= shape_tolerance(1.5), (name, row)
-    assert rows[0]["epsilon"] > 1  # the naive value at 0.02 mm is no value
+    assert rows[0]["epsilon"] > 1  # the naive value at 0.02 mm is meaningless
     assert rows[-1]["epsilon"] < 1e-9
     assert_written("size", numerics.size_table(rows))
 
@@ -83,10 +83,10 @@ def test_what_samples_show_of_gaussians_below_a_pixel(tally: Tally) -> None:
         for name in ("volume", "slices"):
             with tally.case():
                 low, high = row[f"{name} lower bound"], row[f"{name} upper bound"]
-                # the exponential is good to 2e-7 of a amplitude, and a amplitude shows `high` times the mass
+                # the exponential is exact to 2e-7 of an amplitude, and an amplitude shows `high` times the mass
                 assert row[f"{name} least"] >= low * (1 - 1e-5) - 3e-6 * max(1.0, high)
                 assert row[f"{name} most"] <= high * (1 + 1e-4)
-                # and the bounds are reached: on a sample, and between samples
+                # the bounds are reached on a sample and between samples
                 assert row[f"{name} most"] == pytest.approx(high, rel=1e-4)
     slices = [row for row in rows if row["ratio"] <= 0.1]
     assert all(row["slices least"] > 0.92 and row["slices most"] < 1.085 for row in slices)
@@ -105,11 +105,11 @@ def test_values_by_distance_from_the_origin(tally: Tally) -> None:
     rows = distance_rows()
     for row in rows:
         with tally.case():
-            # positions of planes are float64: eps of the distance, over sigma of 1 mm
+            # positions of planes are float64: eps of the distance, relative to a sigma of 1 mm
             assert row["reference float64"] <= 1e-13 + 1e-15 * 1e3 * row["distance_m"]
             for name in FLOAT32:
                 assert row[name] <= shape_tolerance(3.0), (name, row)
-    assert rows[-1]["naive float32"] > 3e-4  # 60 m along an axis are good to 2 um in float32
+    assert rows[-1]["naive float32"] > 3e-4  # float32 resolves 60 m along an axis to 2 um
     assert_written("distance", numerics.distance_table(rows))
 
 

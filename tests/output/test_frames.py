@@ -1,4 +1,4 @@
-"""A result says which space it is in, and how to get there from the scanner's."""
+"""Space of a result: form codes, and the transform from the scanner's space."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_form_codes_and_the_way_from_the_scanner(subject: Path, tmp_path: Path, 
         return
     matrix = np.array(record["standard_from_scanner"])
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
-    # each slice goes where slices.tsv says; the common motion is within what this head moved
+    # each slice is placed by slices.tsv; the common motion is within the motion of this head
     head = nib.Nifti1Image.from_filename(files(subject, "mask")[0])
     points = nib.affines.apply_affine(head.affine, np.argwhere(np.asarray(head.dataobj) > 0)[::500])
     common = points @ matrix[:3, :3].T + matrix[:3, 3]
@@ -61,7 +61,7 @@ def test_form_codes_and_the_way_from_the_scanner(subject: Path, tmp_path: Path, 
         own = np.array(stack["standard_from_scanner"])
         there = poses.take([int(row["stack"]) == n for row in rows]).apply(points[None])
         assert np.median(np.linalg.norm(there - (points @ own[:3, :3].T + own[:3, 3]), axis=2)) < 1.5
-    # the head stands where the volume shows it
+    # the moved head is where the volume shows it
     mask = nib.Nifti1Image.from_filename(out / "mask.nii.gz")
     inside = nib.affines.apply_affine(mask.affine, np.argwhere(np.asarray(mask.dataobj) > 0))
     assert np.linalg.norm(common.mean(0) - inside.mean(0)) < 5

@@ -1,4 +1,4 @@
-"""run.json names the terms that the data cannot determine, with the reason."""
+"""Inactive terms: run.json names the terms that the data cannot determine, with the reason."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""TensorBoard while a fit runs: steps spread over it, there even when the run is killed, and cheap."""
+"""TensorBoard during a fit: entries are written while it runs, also when the run fails, and do not change it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
 
 
 def written(folder: Path) -> tuple[dict[str, list[tuple[int, float, float]]], dict[str, list[int]]]:
-    """Scalars (step, value, when) and steps of images in the event files of a folder."""
+    """Scalars (step, value, time) and steps of images in the event files of a folder."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0})
@@ -43,7 +43,7 @@ def written(folder: Path) -> tuple[dict[str, list[tuple[int, float, float]]], di
 def test_every_step_of_both_fits_is_written_when_it_is_done(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not all at once: each goes to the writer before the fit does the next, with other parameters."""
+    """Each entry goes to the writer before the fit makes the next step, which changes the parameters."""
     from torch.utils.tensorboard.writer import FileWriter
 
     from g3r.output.live_board import LiveBoard
@@ -66,7 +66,7 @@ def test_every_step_of_both_fits_is_written_when_it_is_done(
     monkeypatch.setattr(LiveBoard, "__call__", watched)
     monkeypatch.setattr(FileWriter, "add_summary", counted)
     assert main(case.arguments(tmp_path / "out", "--tensorboard", str(tmp_path / "board"))) == 0
-    assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume  # watching changes nothing
+    assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume  # logging does not change the result
     scalars, images = written(tmp_path / "board")
     assert [step for step, _, _ in scalars["fit to prior/loss/image"]] == list(range(1, N_PRIOR_STEPS + 1))
     steps, losses, _ = zip(*scalars["fit to slices/loss/image"], strict=True)
@@ -84,7 +84,7 @@ def test_every_step_of_both_fits_is_written_when_it_is_done(
 
 
 def test_what_came_before_a_failure_is_there(case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The files are read while the fit is at a step, as TensorBoard does it."""
+    """The files are read during a step of the fit, as TensorBoard does."""
     from g3r.output.live_board import FLUSH_S, LiveBoard
 
     seen: list[int] = []

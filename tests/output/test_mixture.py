@@ -1,4 +1,4 @@
-"""The written volume with a correction: on its own grid to the last digit, on others interpolated, never beside it."""
+"""The written volume with a correction on voxels: exact on its own grid, interpolated on others, within the support."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MIXTURE = Mixture(
 
 
 def added(grid: VolumeGrid) -> np.ndarray:
-    """What the correction adds on a grid."""
+    """The added correction on a grid."""
     without = replace(MIXTURE, correction=None)
     return MIXTURE.volume(true_cloud(), grid) - without.volume(true_cloud(), grid)
 

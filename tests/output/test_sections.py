@@ -1,4 +1,4 @@
-"""The picture: sides are where the letters say, rows and sizes are right, files are whole."""
+"""The picture of sections: sides agree with their letters, rows and sizes are right, files are complete."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def columns(image: np.ndarray) -> list[np.ndarray]:
 
 
 def side(panel: np.ndarray) -> tuple[bool, bool]:
-    """Where the bright spot lies: (left of the middle, above the middle)."""
+    """Side of the bright spot: (left of the centre, above the centre)."""
     rows, cols = np.nonzero(panel > 200)
     return cols.mean() < panel.shape[1] / 2, rows.mean() < panel.shape[0] / 2
 
 
 def test_radiological_sides(tmp_path: Path) -> None:
-    # bright in the right, anterior, superior part; big enough to be met by all three central planes
+    # bright in the right, anterior, superior part; large enough to cross all three central planes
     save_sections(tmp_path / "a.png", {"volume": ball((27, 33, 20), 13) * 100}, AFFINE)
     axial, coronal, sagittal = columns(pixels(tmp_path / "a.png"))
     assert side(axial) == (True, True)  # right on the left, anterior up
@@ -55,7 +55,7 @@ def test_the_header_decides_and_not_the_array(tmp_path: Path, flip: tuple[int] |
         affine[:3, 3] += affine[:3, axis] * (SHAPE[axis] - 1)
         affine[:3, axis] *= -1
     mask = np.ones(SHAPE, bool)
-    mask[0] = mask[:, 0] = mask[:, :, 0] = False  # an odd extent has one middle, whichever way it is counted
+    mask[0] = mask[:, 0] = mask[:, :, 0] = False  # an odd extent has the same middle from both ends
     save_sections(tmp_path / "a.png", {"v": data}, AFFINE, mask)
     save_sections(tmp_path / "b.png", {"v": np.flip(data, flip)}, affine, np.flip(mask, flip))
     np.testing.assert_allclose(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"), atol=1)
@@ -78,13 +78,13 @@ def test_a_row_per_volume_and_a_bar_for_maps(tmp_path: Path) -> None:
 
 
 def outline_of(path: Path) -> np.ndarray:
-    """The pixels of a picture that have the colour of the outline."""
+    """Pixels of a picture in the colour of the outline."""
     red, green, blue = np.moveaxis(np.asarray(Image.open(path).convert("RGB")).astype(int), -1, 0)
     return (blue > 120) & (blue > red + 60) & (green > red + 40)
 
 
 def test_a_marked_part_is_outlined_where_it_lies(tmp_path: Path) -> None:
-    """Around the right, anterior, superior part: its sides are those of the volume."""
+    """The outline surrounds the right, anterior, superior part, with the sides of the volume."""
     data = ball(radius=13) * 100
     save_sections(tmp_path / "plain.png", {"volume": data}, AFFINE)
     assert not outline_of(tmp_path / "plain.png").any()
@@ -94,7 +94,7 @@ def test_a_marked_part_is_outlined_where_it_lies(tmp_path: Path) -> None:
     for panel in columns(found.astype(float) * 255):
         assert panel.max() > 200  # in each of the three sections
         assert side(panel) == (True, True)
-    # turned with the volume, whatever the header
+    # oriented like the volume for any header
     save_sections(
         tmp_path / "b.png",
         {"volume": data.transpose(2, 0, 1)},
@@ -102,7 +102,7 @@ def test_a_marked_part_is_outlined_where_it_lies(tmp_path: Path) -> None:
         marked=ball((28, 34, 20), 12).transpose(2, 0, 1),
     )
     np.testing.assert_array_equal(outline_of(tmp_path / "b.png"), found)
-    # in every row, and none where nothing or everything is marked
+    # in every row; no outline if nothing or everything is marked
     save_sections(tmp_path / "two.png", {"volume": data, "density": data}, AFFINE, marked=ball((28, 34, 20), 12))
     upper, lower = np.array_split(outline_of(tmp_path / "two.png"), 2)
     assert min(upper.sum(), lower.sum()) > 100

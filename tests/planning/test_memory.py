@@ -1,4 +1,4 @@
-"""--max-memory: what is needed, said beforehand; a plan that keeps below a limit, or one line of refusal."""
+"""--max-memory: memory stated beforehand; a plan below a limit, or one line of refusal."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_what_is_no_size(text: str) -> None:
 
 def test_sizes_for_people_are_rounded_up() -> None:
     assert [gigabytes(n) for n in (1, 1.1e9, 1.101e9, 2.345e10)] == ["0.01 GB", "1.10 GB", "1.11 GB", "23.45 GB"]
-    assert parsed_size(gigabytes(987_654_321)) >= 987_654_321  # what is said can be typed
+    assert parsed_size(gigabytes(987_654_321)) >= 987_654_321  # the displayed size can be entered
 
 
 def test_more_of_anything_needs_more(slices: Slices) -> None:
@@ -113,7 +113,7 @@ def test_more_of_anything_needs_more(slices: Slices) -> None:
     )
     threads = [estimate_memory(slices, PREVIEW, n, PROCESS).stages[Stage.REGISTRATION] for n in (1, 2, 4, 64)]
     assert threads == sorted(threads)
-    assert threads[2] == threads[3]  # scattering takes four at most
+    assert threads[2] == threads[3]  # scattering uses at most four threads
 
 
 def test_without_a_limit_nothing_changes(slices: Slices) -> None:
@@ -134,19 +134,19 @@ def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices)
         except InputError as error:
             refused.append(str(error))
             continue
-        assert not refused  # less never fits again
+        assert not refused  # a lower limit never fits once one was refused
         assert plan.estimate.peak <= limit
-        assert plan.settings.resolution_mm == PREVIEW.resolution_mm  # nobody asked for another volume
+        assert plan.settings.resolution_mm == PREVIEW.resolution_mm  # the voxel size is not changed unasked
         assert bool(plan.changes) == (limit < free)
         if plan.settings.prior_whole_voxels == 0:
             assert plan.settings.prior_halo_voxels == PLANNED_HALO_VOXELS
-    assert "--no-prior (" in refused[0]  # which needs less than the network
+    assert "--no-prior (" in refused[0]  # --no-prior needs less memory than the network
     assert "--no-prior" not in refused[-1]
     assert all("choose a coarser --resolution" in line for line in refused if "--no-prior" not in line)
 
 
 def test_projections_are_given_up_where_the_fit_needs_most(slices: Slices) -> None:
-    """Many Gaussians: their projections take the most."""
+    """With many Gaussians, their projections need the most memory."""
     many = replace(PREVIEW, gaussian_spacing_pixels=0.22, use_prior=False)
     free = plan_memory(slices, many, None, process_bytes=PROCESS).estimate
     assert free.stage == "fit to slices"
@@ -159,7 +159,7 @@ def test_projections_are_given_up_where_the_fit_needs_most(slices: Slices) -> No
 
 @pytest.fixture
 def fixed_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Statements that do not depend on what this process holds."""
+    """Make statements independent of the memory of this process."""
     for module in (g3r.planning.memory_estimate, g3r.planning.memory_limit):
         monkeypatch.setattr(module, "held_bytes", lambda: PROCESS)
 
@@ -173,7 +173,7 @@ def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.Captu
 
     assert stated("--preset", "fast").startswith("needs about 1.")
     assert "most of it in uncertainty" in stated("--preset", "fast", "--resolution", "0.3")
-    # memory for a time budget is planned for the most that it may take
+    # with a time budget, memory is planned for the largest settings
     fine = ("--resolution", "0.3", "--no-prior")
     assert stated("--time-budget", "5", *fine) == stated("--preset", "accurate", *fine)
     assert not (tmp_path / "out").exists()

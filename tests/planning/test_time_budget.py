@@ -1,4 +1,4 @@
-"""--time-budget: the settings that fit, a valid volume however little time there is."""
+"""--time-budget: the chosen settings, and a valid volume however short the time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SETTINGS = replace(QUICK_FIT, resolution_mm=1.5, use_prior=False)
 
 
 class Clock:
-    """Stands still unless it is moved."""
+    """A clock that stands still unless the test moves it."""
 
     now = 50.0
 
@@ -115,7 +115,7 @@ def test_the_correction_on_voxels_is_that_of_the_fit_that_is_made() -> None:
 
 def test_slices_are_searched_for_as_the_budget_chose(stacks: list[Stack], monkeypatch: pytest.MonkeyPatch) -> None:
     class Searched(Exception):
-        """Ends the run where the search would begin."""
+        """Raised where the search would begin, to end the run."""
 
     def register(slices: Slices, settings: RegistrationSettings, *_: Any) -> Registration:
         raise Searched(settings)
@@ -209,7 +209,7 @@ def test_the_seconds_of_compiling_count(
 
 
 def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
-    """The registration is given, so that the test is quick."""
+    """The registration is given, to keep the test quick."""
     reconstructor = GaussianReconstructor(settings=SETTINGS)
     registration = reconstructor.register_stacks(stacks)
     result = reconstructor.reconstruct(stacks, registration, plan=TimeBudget.of(SETTINGS, 600.0))

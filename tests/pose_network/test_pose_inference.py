@@ -1,4 +1,4 @@
-"""From slices to poses: what may not matter does not, and stacks are fitted against bad slices."""
+"""Pose inference: invariances of the predictions, and robust motions of stacks."""
 
 import dataclasses
 import subprocess
@@ -39,7 +39,7 @@ def model(network: PoseNetwork) -> PoseModel:
 
 
 def blob_stack(rotation: np.ndarray, seed: int, shape: tuple[int, int, int] = (50, 46, 12)) -> Stack:
-    """A stack of an egg with a bright spot, turned in the scanner."""
+    """A stack of an egg with a bright spot, rotated in the scanner."""
     rng = np.random.default_rng(seed)
     affine = np.eye(4)
     affine[:3, :3] = rotation * [1.2, 1.2, 4.0]
@@ -92,7 +92,7 @@ def test_present_poses_do_not_matter(model: PoseModel, slices: Slices) -> None:
 def test_the_order_does_not_matter(model: PoseModel, slices: Slices) -> None:
     order = np.random.default_rng(0).permutation(len(slices))
     before = model.predict(slices).take(order)
-    assert_same(before, model.predict(slices.take(order)), 1e-2)  # sums in another order
+    assert_same(before, model.predict(slices.take(order)), 1e-2)  # sums in a different order
 
 
 def test_numbers_of_stacks_do_not_matter(model: PoseModel, slices: Slices) -> None:
@@ -109,7 +109,7 @@ def test_numbers_of_stacks_do_not_matter(model: PoseModel, slices: Slices) -> No
 
 
 def test_cropping_does_not_matter(model: PoseModel, slices: Slices) -> None:
-    """The pose is that of the slice's own frame, wherever the cropping put its centre."""
+    """The pose refers to the slice's own frame, wherever its centre lies in the cropped image."""
     planes = slices.planes
     parts = [slice(*planes.offset[k : k + 2]) for k in range(len(slices))]
     width = planes.shape[:, 1]
@@ -132,7 +132,7 @@ def test_cropping_does_not_matter(model: PoseModel, slices: Slices) -> None:
 def test_a_slice_turned_over_is_the_same_slice(
     network: PoseNetwork, slices: Slices, view: tuple[int, int, int]
 ) -> None:
-    """Other signs of a slice's own axes: the same pixels, so the same place."""
+    """Flipped axes of a slice with the same pixels give the same place."""
     images = slice_images(slices, 3.0, 40)
     flips = tuple(slice(None, None, sign) for sign in view[:2])
     turned = dataclasses.replace(
@@ -166,7 +166,7 @@ def test_a_single_slice(model: PoseModel, slices: Slices) -> None:
 
 
 def test_time_is_used_if_known(network: PoseNetwork, slices: Slices) -> None:
-    """Trainings know the order of acquisition of some stacks."""
+    """In training the order of acquisition is known for some stacks only."""
     images = slice_images(slices, 3.0, 40)
     known = dataclasses.replace(images, time_rank=np.linspace(0, 1, len(slices)))
     with_time, without = (poses_of(network, slice_batch([some])) for some in (known, images))

@@ -1,4 +1,4 @@
-"""The pose network's pieces against plain references, its symmetries, and that it can learn at all."""
+"""Parts of the pose network against plain references, its symmetries, and overfitting of a tiny set."""
 
 from dataclasses import replace
 from typing import Any
@@ -68,7 +68,7 @@ def test_nearest_rotation_and_its_gradient() -> None:
     nearest = nearest_rotation(matrix)
     torch.testing.assert_close(nearest @ nearest.transpose(1, 2), torch.eye(3).double().expand(6, 3, 3))
     assert (torch.linalg.det(nearest) > 0).all()
-    for near, one in zip(nearest, matrix, strict=True):  # no other rotation is nearer
+    for near, one in zip(nearest, matrix, strict=True):  # no other rotation is closer
         distance = (rotations(200, 1) - one).square().sum((1, 2)).min()
         assert (near - one).square().sum() <= distance
     assert torch.autograd.gradcheck(nearest_rotation, matrix)
@@ -160,7 +160,7 @@ def test_headers_between_stacks_do_count() -> None:
     with torch.no_grad():
         one, other = network(batch)[0].rotation, network(changed)[0].rotation
     assert (one - other)[batch["stack"] == 1].abs().max() > 1e-3
-    torch.testing.assert_close(one[batch["stack"] == 2], other[batch["stack"] == 2])  # another head
+    torch.testing.assert_close(one[batch["stack"] == 2], other[batch["stack"] == 2])  # the stack of another head
 
 
 def test_heads_of_a_batch_do_not_see_each_other() -> None:

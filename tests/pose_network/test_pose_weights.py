@@ -1,4 +1,4 @@
-"""The pose network that ships with g3r, on simulated subjects of weeks that it has never seen."""
+"""The shipped pose network on simulated subjects of weeks that it was not trained on."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def shipped() -> PoseModel:
 
 def test_the_file_is_small_and_says_what_it_is(shipped: PoseModel) -> None:
     assert weights_path(None, "pose").stat().st_size <= 6_000_000
-    assert "sta30" in shipped.training_data  # among what was left out
+    assert "sta30" in shipped.training_data  # named among the excluded subjects
     assert shipped.template.weeks.tolist() == [22, 25, 28, 31, 34, 37]
     assert {"val/slice_mm", "val/stack_deg", "val/stacks_within_20deg"} <= set(shipped.validation)
     np.testing.assert_allclose(shipped.template.volume, shipped.template.volume[:, ::-1], atol=2e-3)

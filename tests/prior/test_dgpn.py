@@ -26,7 +26,7 @@ def given() -> PriorInputs:
 
 
 def awaken(network: DensityGatedPriorNetwork) -> DensityGatedPriorNetwork:
-    """Give the zero-initialised last convolution weights, so that F does something."""
+    """Set random weights in the zero-initialised last convolution, so that F is not zero."""
     torch.manual_seed(1)
     nn.init.normal_(network.refiner.head.weight, std=0.02)
     return network.eval()
@@ -48,7 +48,7 @@ def test_equation_7_with_a_known_residual(given: PriorInputs, alpha: float, beta
     expected = v_coarse + (alpha * c + beta * (1 - c)) * (v_coarse + 10 * m_rho)
     found = network(PriorInputs(coarse=v_coarse, density=m_rho))
     torch.testing.assert_close(found.volume, expected, rtol=1e-14, atol=1e-14)
-    # the gate is of intensities; what is brain is the network's to say at any density
+    # the gate acts on intensities only; the network decides what is brain at any density
     torch.testing.assert_close(found.brain_logit, CERTAIN_LOGIT + 7 * v_coarse, rtol=1e-14, atol=1e-14)
 
 
@@ -105,7 +105,7 @@ def test_density_of_0_and_1e6_gives_finite_values_and_gradients(given: PriorInpu
 
 
 def test_activations_keep_their_size_at_the_start() -> None:
-    """Without normalisation, the initial scale is all there is."""
+    """Without normalisation layers, only the initial weights control the scale."""
     torch.manual_seed(0)
     refiner = ResidualRefiner(PriorNetworkConfig(use_sharp=False, use_template=False))
     seen = []
@@ -171,7 +171,7 @@ def test_a_template_of_any_shape_is_taken_as_it_will_be_stored() -> None:
 
 @pytest.mark.parametrize("n", [4, 13, 25, 30, 49, 60])
 def test_the_template_s_grid_has_its_shape(n: int) -> None:
-    """Whatever way (n - 1) times 1.6 is rounded."""
+    """This holds however (n - 1) times 1.6 is rounded."""
     grid = replace(SMALL, template_shape=(1, n, 5, 4), template_spacing_mm=1.6).template_grid
     assert grid.shape == (n, 5, 4)
     np.testing.assert_allclose(grid.world([0, 0, 0]), -0.8 * np.array([n - 1, 4, 3]), atol=1e-9)

@@ -1,4 +1,4 @@
-"""What the prior starts from: the measured volume where slices looked, the template where none did."""
+"""Inputs of the prior: the base is the measured volume where slices covered, the template elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONFIGS = {"coarse": SMALL, "sharp": replace(SMALL, sharp_base=True)}
 
 @pytest.fixture
 def given() -> PriorInputs:
-    """The upper half has not been seen; of the lower one a part is brain."""
+    """Inputs in which the upper half is unseen and a part of the lower half is brain."""
     torch.manual_seed(0)
     coarse, sharp, template = (torch.rand(SHAPE) for _ in range(3))
     density, share, outline = torch.full(SHAPE, 3.0), torch.zeros(SHAPE), torch.zeros(SHAPE)
@@ -37,7 +37,7 @@ def test_the_base_is_what_was_measured_and_the_template_where_nothing_was(given:
     base = given.base(CONFIGS[name])
     torch.testing.assert_close(base[..., 6:], given.template[..., 6:])
     torch.testing.assert_close(base[..., :6], measured[..., :6], atol=1e-5, rtol=0)
-    # with more density more of what was measured
+    # with higher density the measured volume dominates
     part = [
         float((replace(given, density=torch.full(SHAPE, m)).base(CONFIGS[name]) - measured).abs().mean())
         for m in (0.0, 0.2, 0.5, 1.0)
@@ -58,7 +58,7 @@ def test_an_untrained_network_is_its_base(given: PriorInputs, name: str) -> None
     assert given.outline is not None
     torch.testing.assert_close(brain[..., :6] > 0.5, given.share[..., :6] > 0.5)
     torch.testing.assert_close(brain[..., 6:] > 0.5, given.outline[..., 6:] > 0.5)
-    assert float((brain - 0.5).abs().min()) > 0.449  # sure either way, but not beyond what training can change
+    assert float((brain - 0.5).abs().min()) > 0.449  # confident both ways, but not more than training can change
     assert float((brain - 0.5).abs().max()) < 0.499
 
 
@@ -74,7 +74,7 @@ def test_without_a_template_masks_say_what_is_brain(given: PriorInputs) -> None:
 def test_the_network_changes_the_base_by_no_more_than_the_gate(
     given: PriorInputs, density: float, alpha: float
 ) -> None:
-    """However large its weights are."""
+    """This holds however large its weights are."""
     torch.manual_seed(0)
     config = replace(SMALL, alpha=alpha)
     network = DensityGatedPriorNetwork(config)

@@ -66,7 +66,7 @@ def test_whole_volume_is_the_network_s_output(
 
 def test_tiles_agree_with_the_whole(network: DensityGatedPriorNetwork, maps: PriorMaps, whole: EstimatedPrior) -> None:
     tiled = estimate_prior(network, maps, tiling=Tiling(max_whole_voxels=0, tile_voxels=48))
-    # The default halo, on white noise and random weights, which look further than an image and trained ones.
+    # The default halo, with white noise and random weights, which have longer reach than images and trained weights.
     assert largest_difference(tiled, whole) < 1e-3
 
 
@@ -75,12 +75,12 @@ def test_tiles_are_exact_beyond_the_receptive_field(
 ) -> None:
     halo = receptive_radius_voxels(network.config)
     tiled = estimate_prior(network, maps, tiling=Tiling(0, tile_voxels=40, halo_voxels=halo))
-    # Rounding only: other extents make the convolution add in another order.
+    # Rounding only: with other extents the convolution sums in another order.
     assert largest_difference(tiled, whole) < 1e-5
 
 
 def test_views_do_not_prefer_a_side(maps: PriorMaps) -> None:
-    """The mean over all mirror images is mirrored when the head is; whether in tiles or not."""
+    """The mean over all mirror images of a mirrored head is the mirrored mean, in tiles or whole."""
     torch.manual_seed(0)
     network = small(n_levels=2)
     nn.init.normal_(network.refiner.head.weight, std=0.05)
@@ -109,7 +109,7 @@ def test_v_sharp_is_asked_for_and_is_the_base(maps: PriorMaps) -> None:
 def test_without_a_halo_they_do_not_agree(
     network: DensityGatedPriorNetwork, maps: PriorMaps, whole: EstimatedPrior
 ) -> None:
-    """The two tests above would notice a tile that is cut off."""
+    """This shows that the two tests above would detect cut-off tiles."""
     tiled = estimate_prior(network, maps, tiling=Tiling(0, tile_voxels=48, halo_voxels=0))
     assert largest_difference(tiled, whole) > 1e-2
 

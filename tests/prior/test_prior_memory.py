@@ -1,4 +1,4 @@
-"""What keeps the prior network's memory small: layers in slabs, tiles of one shape."""
+"""Memory savings of the prior network: layers in slabs, tiles of one shape."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def refiner() -> ResidualRefiner:
 def test_slabs_give_what_the_whole_gives(refiner: ResidualRefiner, extra: int) -> None:
     rows = 2 * (SLAB_ROWS + extra)
     given = noise(rows, 12, 20)
-    whole = refiner(given)  # a gradient is wanted: all at once
+    whole = refiner(given)  # with gradients the layer runs in one piece
     with torch.inference_mode():
         slabs = refiner(given)
     for one, two in zip(slabs, whole, strict=True):
@@ -58,7 +58,7 @@ def test_slabs_all_have_one_shape(refiner: ResidualRefiner, monkeypatch: pytest.
 
 
 def test_gradients_are_those_of_a_network_that_keeps_everything(refiner: ResidualRefiner) -> None:
-    """Activations overwrite their input, which nothing needs."""
+    """Activations overwrite their input, which is not needed afterwards."""
     other = copy.deepcopy(refiner)
     for module in other.modules():
         if isinstance(module, nn.LeakyReLU):

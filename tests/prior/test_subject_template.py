@@ -1,4 +1,4 @@
-"""The template of a subject: the head nearest in age, enlarged about its own centre, fitted where slices looked."""
+"""The template of a subject: the head nearest in age, scaled about its own centre, fitted to the seen part."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def test_it_is_enlarged_about_its_own_centre(scale: float) -> None:
     np.testing.assert_allclose((low + high) / 2, CENTER_MM, atol=1.1 * scale)
     np.testing.assert_allclose(low, inside.min(0))
     np.testing.assert_allclose(placed.grid.spacing_mm, 2 * scale)
-    np.testing.assert_allclose(TEMPLATE.affine, GRID.affine)  # the atlas's own is left alone
+    np.testing.assert_allclose(TEMPLATE.affine, GRID.affine)  # the atlas template itself is unchanged
 
 
 def test_it_is_fitted_to_what_was_seen_whatever_the_density() -> None:
-    """A head of another size and place, of which one half was seen, in places by many slices."""
+    """A head of another size and place, one half of which is seen, partly by many slices."""
     grid = VolumeGrid.isotropic([-34] * 3, [34] * 3, 2.0)
     world = grid.world(np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1))
     shift, size = np.array([2.0, -1.5, 1.0]), 1.07

@@ -1,4 +1,4 @@
-"""Heads that the tests of registration share; making them takes longer than most of the tests."""
+"""Heads shared by the registration tests; making them takes longer than most of the tests."""
 
 import pytest
 
@@ -28,26 +28,26 @@ def still(head: Phantom) -> list[SimulatedStack]:
 
 @pytest.fixture(scope="session")
 def still_slices(still: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
-    """The same as slices, and their true motions: none."""
+    """The still stacks as slices, and their true motions, which are identities."""
     return as_slices(still)
 
 
 @pytest.fixture(scope="session")
 def samples(still_slices: tuple[Slices, RigidPose]) -> list[StackSamples]:
-    """Their thinned pixels, stack by stack."""
+    """The stack samples of the still slices."""
     return StackSamples.of_all(still_slices[0])
 
 
 @pytest.fixture(scope="session")
 def template() -> AtlasTemplate:
-    """Atlas templates of other phantoms, about as old and older."""
+    """Atlas templates of other phantoms, of similar and higher age."""
     subjects = [PhantomSubject(f"week-{w}-{seed}", w, seed) for w in (24.0, 31.0) for seed in (1, 2, 3)]
     return atlas_templates(subjects, 3.0, weeks=(24, 31))
 
 
 @pytest.fixture(scope="session")
 def moving(head: Phantom, template: AtlasTemplate) -> Moving:
-    """Severe motion with every layer on: walks, four jerks a stack, stacks 25 degrees per axis apart."""
+    """Severe motion with all layers of registration: walks, four jerks per stack, stacks 25 degrees per axis apart."""
     stacks = simulated(head, LEVELS["severe"], seed=2)
     slices, truth = as_slices(stacks)
     calls: list[tuple[int, int]] = []

@@ -1,4 +1,4 @@
-"""Small moving heads whose true poses are known, for the tests of registration."""
+"""Small moving heads with known true poses, for the tests of registration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ STILL = MotionLevel()
 
 @dataclass(frozen=True)
 class Moving:
-    """A head that moved, the truth, and one estimate of it with every layer on."""
+    """A moving head, its true poses, and one registration with all layers."""
 
     stacks: list[SimulatedStack]
     slices: Slices
@@ -38,7 +38,7 @@ def simulated(
     seed: int = 0,
     interleave: int = 2,
 ) -> list[SimulatedStack]:
-    """Clean thick stacks of a head; a level for all of them, or one for each."""
+    """Noise-free thick stacks of a head, with one level of motion for all or one for each."""
     settings = orthogonal_settings(
         n_stacks, resolution_mm=1.5, thickness_mm=4.0, snr=60.0, bias=0.0, gain_deviation=0.0
     )
@@ -50,7 +50,7 @@ def simulated(
 
 
 def as_slices(stacks: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
-    """Slices with intensities of order one, and where a point by the header truly lies."""
+    """Slices with intensities of order one, and the true motion of each."""
     slices = slices_from_stacks([one.stack for one in stacks])
     slices = slices.scaled(1 / float(np.percentile(slices.masked_value, 99)))
     poses = [one.true_pose for one in stacks]
@@ -62,23 +62,23 @@ def as_slices(stacks: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
 
 
 def pixel_errors_mm(slices: Slices, truth: RigidPose) -> np.ndarray:
-    """Distance of every masked pixel from its true place once one global motion is taken out [P'].
+    """Distance [P'] of every masked pixel from its true place after removal of one global motion.
 
-    The global motion is fitted robustly, so that slices that went astray do not tilt it.
+    The global motion is fitted robustly, so that slices astray do not tilt it.
     """
     found, true = slices.planes.pixel_world_mm(slices.pixel_index), true_places_mm(slices, truth)
     return fit_rigid_robust(found, true, scale_mm=1.0, n_rounds=8)[1]
 
 
 def true_places_mm(slices: Slices, truth: RigidPose) -> np.ndarray:
-    """Where every masked pixel truly lies [P', 3]."""
+    """True position of every masked pixel [P', 3]."""
     header = slices.planes.with_pose(slices.header_pose).pixel_world_mm(slices.pixel_index)
     plane = slices.pixel_plane
     return np.einsum("pij,pj->pi", truth.rotation[plane], header) + truth.translation_mm[plane]
 
 
 def slices_disturbed(slices: Slices, degrees: float, mm: float, seed: int = 0) -> Slices:
-    """Every slice turned and shifted at random about its own middle."""
+    """Slices, each rotated and shifted at random about its own centre."""
     rng = np.random.default_rng(seed)
     turn = RigidPose.from_rotvec(np.deg2rad(rng.normal(0, degrees, (len(slices), 3))), np.zeros((len(slices), 3)))
     pose = slices.planes.pose @ turn
@@ -86,7 +86,7 @@ def slices_disturbed(slices: Slices, degrees: float, mm: float, seed: int = 0) -
 
 
 def stack_moved(motion: RigidPose, slices: Slices, stack: int, by: RigidPose) -> RigidPose:
-    """Motions [K] of which those of one stack are followed by one more."""
+    """Motions [K], with an additional motion for one stack."""
     rows = slices.stack_id == stack
     after = by @ motion
     return RigidPose(
@@ -96,13 +96,13 @@ def stack_moved(motion: RigidPose, slices: Slices, stack: int, by: RigidPose) ->
 
 
 def turned_about(center_mm: np.ndarray, rotvec_rad: np.ndarray, translation_mm: np.ndarray) -> RigidPose:
-    """One motion: a turn about a point, then a shift."""
+    """One motion: a rotation about a point, then a shift."""
     turn = RigidPose.from_rotvec([rotvec_rad], np.zeros((1, 3)))
     return RigidPose(turn.rotation, (center_mm - turn.rotation[0] @ center_mm + translation_mm)[None])
 
 
 def with_jerk(slices: Slices, at: np.ndarray) -> Slices:
-    """The head was elsewhere while some slices were taken, which lie where their headers say."""
+    """Slices of a head that had moved during some of them, with poses still by the headers."""
     center_mm = slices.planes.pixel_world_mm(slices.pixel_index).mean(0)
     jerk = turned_about(center_mm, np.deg2rad([14.0, -10.0, 8.0]), np.array([5.0, 7.0, -6.0]))
     header = slices.header_pose
@@ -112,7 +112,7 @@ def with_jerk(slices: Slices, at: np.ndarray) -> Slices:
 
 
 def off_mm(slices: Slices, true: Slices) -> np.ndarray:
-    """Mean distance [K] of the masked pixels of each slice from where they were taken."""
+    """Mean distance [K] of the masked pixels of each slice from their true positions."""
     there = [one.planes.pixel_world_mm(one.pixel_index) for one in (slices, true)]
     apart = np.linalg.norm(there[0] - there[1], axis=1)
     return np.bincount(slices.pixel_plane, apart, len(slices)) / np.bincount(slices.pixel_plane)
@@ -124,7 +124,7 @@ def rotation_angle_deg(rotation: np.ndarray) -> float:
 
 
 def sheared(slices: Slices, amount: float) -> Slices:
-    """Slices that follow a shear of the head which changes none of their pixels, to first order."""
+    """Slices after the open shear, which to first order changes none of their pixels."""
     strain, pose = open_strain(mean_normals(slices)), slices.planes.pose
     assert strain is not None
     turn = Rotation.from_rotvec(amount * tilts(pose.rotation[:, :, 2], strain)).as_matrix()

@@ -1,4 +1,4 @@
-"""The standard orientation of a single stack: all orientations are tried, and one that fits as well is told."""
+"""Standard orientation of a single stack: all orientations are tried, and an ambiguous one is reported."""
 
 from dataclasses import replace
 
@@ -18,17 +18,17 @@ from g3r.registration.thresholds import MIN_RIVAL_MARGIN
 from tests.registration.moving_heads import STILL, as_slices, rotation_angle_deg, simulated, turned_about
 
 START_DEG = 150.0
-"""Where the search is said to have ended: far from the truth, which is the header poses."""
+"""Simulated wrong end of the search, far from the truth, which is the header poses."""
 
 
 @pytest.fixture(scope="module")
 def own_template() -> AtlasTemplate:
-    """The head itself, as a template of its age."""
+    """The head itself as a template of its age."""
     return atlas_templates([PhantomSubject("the head", 24.0, 0)], 2.0, weeks=(24,))
 
 
 def found_from_far(slices: Slices, template: AtlasTemplate) -> Orientation | None:
-    """The standard orientation of slices that a search took to a wrong one."""
+    """The standard orientation of slices after a search that ended at a wrong one."""
     middle = slices.planes.center_mm.mean(0)
     far = turned_about(middle, np.deg2rad([START_DEG, 0, 0]), np.zeros(3))
     start = RigidPose.concatenated([far] * len(slices))
@@ -36,7 +36,7 @@ def found_from_far(slices: Slices, template: AtlasTemplate) -> Orientation | Non
 
 
 def turn_deg(found: Orientation, slices: Slices) -> float:
-    """Angle of the whole head from the truth."""
+    """Rotation angle of the whole head from the truth."""
     return rotation_angle_deg((found.pose @ slices.planes.pose.inverse()).rotation[0])
 
 
@@ -62,7 +62,7 @@ def test_a_template_that_looks_alike_the_other_way_round_makes_the_orientation_d
     low, high = inside.min(0), inside.max(0) + 1
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     both = np.zeros_like(volume)
-    both[box] = (volume[box] + volume[box][::-1, ::-1]) / 2  # turned by half a circle about the third axis
+    both[box] = (volume[box] + volume[box][::-1, ::-1]) / 2  # rotated by 180 degrees about the third axis
     slices, _ = as_slices(simulated(head, STILL, n_stacks=1, seed=2))
     found = found_from_far(slices, replace(own_template, volume=both[None]))
     assert found is not None

@@ -1,4 +1,4 @@
-"""Where an unknown head lies, whichever way it was scanned."""
+"""The atlas search finds a head in any orientation."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ PLACE_MM = np.array([20.0, -30.0, 40.0])
 
 
 def turned_phantom(head: Phantom, rotation: np.ndarray) -> Phantom:
-    """The head lying another way in the scanner, away from the origin."""
+    """The head in another orientation in the scanner, away from the origin."""
     affine = head.affine.copy()
     affine[:3] = rotation @ head.affine[:3]
     affine[:3, 3] += PLACE_MM
@@ -48,7 +48,7 @@ def turned_phantom(head: Phantom, rotation: np.ndarray) -> Phantom:
 
 
 def headers_turned(slices: Slices, rotvec: list[float]) -> Slices:
-    """The same slices with headers that say that everything lies another way."""
+    """The same slices with headers that are rotated as a whole."""
     turned = turned_about(np.zeros(3), np.array(rotvec), PLACE_MM) @ slices.header_pose
     return replace(slices.with_pose(turned), header_pose=turned)
 
@@ -68,7 +68,7 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
     assert np.median(error) < 2
     assert error.max() < 5
     assert max(angle_deg(m @ rotation, np.eye(3)) for m in motion.rotation) < 15
-    # the atlas frame is that of the phantom, but for the turn
+    # the atlas frame is the phantom's frame except for the rotation
     upright = standard_orientation(slices, placed.templates, motion, rng)
     assert upright is not None
     back = upright.pose @ slices.planes.pose.inverse()
@@ -84,7 +84,7 @@ def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], t
     settings = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=3.0)
     plain = register(slices, settings, template=template)
     assert plain.orientation is not None
-    # the phantom stands as the atlas does
+    # the phantom has the orientation of the atlas
     assert max(rotation_angle_deg(r) for r in plain.slices.world_from_header().rotation) < 5
     turned = register(headers_turned(slices, [0, 0, np.pi / 2]), settings, template=template)
     assert turned.orientation is not None
@@ -95,7 +95,7 @@ def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], t
 
 
 def test_the_result_of_a_moving_head_stands_upright(moving: Moving) -> None:
-    """The phantom's own frame is the atlas', so that the true motions lead there."""
+    """The phantom's frame is the atlas frame, so the true motions lead into it."""
     found = moving.estimate.slices.world_from_header()
     common = found @ moving.truth.inverse()
     middle = len(found) // 2
@@ -103,7 +103,7 @@ def test_the_result_of_a_moving_head_stands_upright(moving: Moving) -> None:
     assert angles[middle] < 5
     centers = moving.slices.header_pose.translation_mm[:, None]
     away = np.linalg.norm((found.apply(centers) - moving.truth.apply(centers))[:, 0], axis=1)
-    assert np.median(away) < 8  # the mean head's middle is not quite the phantom's
+    assert np.median(away) < 8  # the centre of the mean head differs slightly from the phantom's
 
 
 def test_scanner_space_on_request(still: list[SimulatedStack], template: AtlasTemplate) -> None:
@@ -146,7 +146,7 @@ def test_masks_of_another_size_than_any_head_are_refused(
     assert template_fits(enlarged(1.2), template)
     assert not template_fits(enlarged(3.0), template)
     assert not template_fits(enlarged(0.5), template)
-    # the estimate goes on without it
+    # the estimate continues without the template
     settings = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=3.0)
     estimate = register(enlarged(3.0), settings, template=template)
     assert estimate.orientation is None
@@ -184,7 +184,7 @@ def test_near_heads_are_the_three_of_about_the_size(
 
 
 def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate) -> None:
-    """A mean head is preferred to noise of the same shape, whichever comes first."""
+    """A mean head is preferred to noise of the same shape, in either order."""
     slices, _ = still_slices
     inside = template.volume[0] > 0
     noise = np.where(inside, np.random.default_rng(0).random(inside.shape), 0).astype(np.float32)
@@ -209,7 +209,7 @@ def test_the_whole_head_turned_is_among_the_orientations_to_follow(
 
 
 def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices: tuple[Slices, RigidPose]) -> None:
-    """Among the orientations of a stack to follow is the true one, and its runs fall into place."""
+    """The true orientation is among those to follow for a stack, and its motion segments are then placed correctly."""
     slices, _ = still_slices
     grid = VolumeGrid(head.t2.shape, head.affine)
     volume = (head.t2 * head.mask / 1000).astype(np.float32)
@@ -223,7 +223,7 @@ def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices:
     error = np.linalg.norm(
         stack.with_motion(placed.motion).planes.center_mm - slices.take(slices.stack_id == 1).planes.center_mm, axis=1
     )
-    assert np.median(error) < 6  # a lattice of 7 mm and 10 degrees
+    assert np.median(error) < 6  # the search lattice has steps of 7 mm and 10 degrees
     assert placed.segments.n_segments <= 3
 
 
@@ -234,7 +234,7 @@ def test_orientations_to_follow_are_few_apart_and_best_first() -> None:
     for height, center in zip((0.70, 0.75, 0.60), centers, strict=True):
         agreement = np.maximum(agreement, height - angle_deg(rotation, center) / 200)
     found = best_orientations(rotation, agreement, 4, 40.0)
-    assert len(found) == 2  # the third is lower by more than the margin
+    assert len(found) == 2  # the third scores lower by more than the margin
     assert angle_deg(found[0], centers[1]) < 1e-4
     assert angle_deg(found[1], centers[0]) < 1e-4
     assert CORRELATION_MARGIN < 0.15

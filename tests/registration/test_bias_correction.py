@@ -1,4 +1,4 @@
-"""The bias field is removed from stacks before they are registered."""
+"""Bias correction of stacks before registration."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from tests.registration.moving_heads import turned_about
 
 
 def shaded(slices: Slices, strength: float) -> Slices:
-    """A smooth factor across each stack, another for each, and none across its slices."""
+    """A different smooth factor in plane for each stack, constant through its slices."""
     planes = slices.planes.with_pose(slices.header_pose)
     plane, world_mm = planes.plane_id(), planes.pixel_world_mm()
     value = slices.value.copy()
@@ -27,7 +27,7 @@ def shaded(slices: Slices, strength: float) -> Slices:
 
 
 def log_ratio_spread(a: Slices, b: Slices) -> float:
-    """How far two versions of the slices differ by more than a factor for each stack."""
+    """Difference of two versions of the slices beyond one factor per stack."""
     ratio = np.log(np.maximum(a.masked_value, 1e-3) / np.maximum(b.masked_value, 1e-3))
     stack = a.stack_id[a.pixel_plane]
     return float(np.mean([ratio[stack == s].std() for s in range(3)]))

@@ -20,7 +20,7 @@ OFF = RegistrationSettings(template=False, network=False, stacks=False, segments
 
 
 def test_the_whole_estimate_on_a_moving_head(moving: Moving) -> None:
-    """Walks, jerks and stack offsets: the poses come back to a fraction of the header's error."""
+    """With walks, jerks and stack offsets, poses are recovered to a fraction of the header's error."""
     slices, estimate = moving.slices, moving.estimate
     before, after = pixel_errors_mm(slices, moving.truth), pixel_errors_mm(estimate.slices, moving.truth)
     assert before.mean() > 4
@@ -32,9 +32,9 @@ def test_the_whole_estimate_on_a_moving_head(moving: Moving) -> None:
         assert array.shape == (len(slices),)
         assert np.isfinite(array).all()
     assert np.median(estimate.ncc) > 0.9
-    # at the poles the volume's blur looks like a gain
+    # at the poles, the blur of the volume looks like a gain
     assert np.quantile(np.abs(np.log(estimate.gain)), 0.8) < 0.1
-    np.testing.assert_array_equal(estimate.slices.value, slices.value)  # bias_corrected for registration alone
+    np.testing.assert_array_equal(estimate.slices.value, slices.value)  # bias correction is for registration only
 
 
 def test_the_whole_estimate_says_how_it_was_found(moving: Moving) -> None:
@@ -64,7 +64,7 @@ def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedS
 
 
 def test_the_finest_voxel_follows_what_a_pixel_covers(still: list[SimulatedStack]) -> None:
-    """In a volume of smaller voxels each slice would find itself."""
+    """In a volume with smaller voxels each slice would be registered to itself."""
     slices, _ = as_slices(still)
     covered_mm3 = float(np.median(slices.planes.spacing_mm.prod(1) * slices.thickness_mm))
     last = [
@@ -87,7 +87,7 @@ def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]) 
 def test_stacks_of_one_or_two_slices(
     still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str
 ) -> None:
-    """Too few to register well, but no reason to break down."""
+    """Too few slices to register well, but no error."""
     slices, _ = as_slices(still)
     rows = np.concatenate([np.flatnonzero(slices.stack_id == s)[6 : 6 + n_slices] for s in (1, 2)])
     mixed = slices.take(np.concatenate([np.flatnonzero(slices.stack_id == 0), rows]))
@@ -100,19 +100,19 @@ def test_stacks_of_one_or_two_slices(
 
 
 def test_proposals_are_initialisations_like_the_others(moving: Moving) -> None:
-    """True poses offered from outside are taken; wrong ones are not, and those of a switched-off network."""
+    """True proposed poses are chosen; wrong ones, and those of a switched-off network, are not."""
     proposals = {"oracle": moving.truth, "astray": RigidPose.identity(len(moving.slices))}
     settings = replace(OFF, network=True)
     estimate = register(moving.slices, settings, proposals=proposals)
     assert estimate.initialisation == "oracle"
-    # two of the three stacks ended up parallel, so a little of an open shear is taken out
+    # two of the three stacks are almost parallel, so a small open shear is removed
     assert np.median(pixel_errors_mm(estimate.slices, moving.truth)) < 0.01
     deaf = register(moving.slices, replace(settings, network=False), proposals=proposals)
     assert set(deaf.initialisations) == {"headers"}
 
 
 def test_the_common_motion_of_all_slices_is_removed(still: list[SimulatedStack]) -> None:
-    """Poses are only determined up to it; a few slices that went astray do not tilt it."""
+    """Poses are determined only up to the common motion, and a few slices astray do not tilt it."""
     slices, _ = as_slices(still)
     motion = RigidPose.from_rotvec([[0.2, -0.3, 0.1]], [[8.0, -5, 12]])
     moved = slices.planes.moved(motion)

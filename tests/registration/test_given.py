@@ -1,4 +1,4 @@
-"""Given poses are measured as those that were searched, and only moved together."""
+"""Given poses are measured like found ones, and only moved together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def slices(subject: Path) -> Slices:
 
 
 def given_of(subject: Path, slices: Slices) -> GivenPoses:
-    """The true motions."""
+    """Given poses: the true motions."""
     table = read_poses(subject / "poses.tsv")
     keys = np.array(list(table.keys))
     return GivenPoses(stack_id=keys[:, 0], slice_index=keys[:, 1], motion=table.pose)
@@ -37,7 +37,7 @@ def test_true_poses_are_found_good_and_stay(subject: Path, slices: Slices) -> No
     expected = slices.with_motion(given.motion_of(slices)).planes
     np.testing.assert_array_equal(found.slices.planes.center_mm, expected.center_mm)
     np.testing.assert_array_equal(found.slices.planes.rotation, expected.rotation)
-    np.testing.assert_array_equal(found.slices.value, slices.value)  # not those that the measuring corrects
+    np.testing.assert_array_equal(found.slices.value, slices.value)  # bias correction is for the measurement only
     assert found.held_out is not None
     assert min(found.held_out) > 0.75
     assert np.median(found.ncc) > 0.9
@@ -47,7 +47,7 @@ def test_true_poses_are_found_good_and_stay(subject: Path, slices: Slices) -> No
 
 
 def test_single_slices_in_wrong_places_get_a_small_weight(subject: Path, slices: Slices) -> None:
-    """Larger ones, whose misfit shows: 15 mm aside."""
+    """The slices are large and 15 mm off, so that their misfit is visible."""
     given = given_of(subject, slices)
     n_pixels = np.bincount(slices.pixel_plane)
     rows = np.argsort(n_pixels)[-9::4]

@@ -1,4 +1,4 @@
-"""A single stack follows the atlas template in segments where that is a gain, and where the template shows the head."""
+"""A single stack is registered to the template in segments if this is a gain and the template resembles the head."""
 
 from dataclasses import replace
 
@@ -21,13 +21,13 @@ JERK = MotionLevel(n_jerks=1, jerk_deg=25.0, jerk_mm=10.0)
 
 @pytest.fixture(scope="module")
 def own_template() -> AtlasTemplate:
-    """The head itself, as a template of its age."""
+    """The head itself as a template of its age."""
     return atlas_templates([PhantomSubject("the head", 24.0, 0)], 3.0, weeks=(24,))
 
 
 @pytest.fixture(scope="module")
 def other_template(own_template: AtlasTemplate) -> AtlasTemplate:
-    """A head of the same outline with nothing of the same anatomy in it."""
+    """A template with the same outline but different anatomy."""
     inside = own_template.volume > 0
     blobs = gaussian_filter(np.random.default_rng(0).random(inside.shape), (0, 1, 1, 1))
     blobs = 0.6 + 0.3 * (blobs - blobs[inside].mean()) / blobs[inside].std()

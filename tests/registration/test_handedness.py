@@ -1,4 +1,4 @@
-"""A stack that is a mirror image of the others is told from one that is not, whatever else is wrong with it."""
+"""Handedness: a mirrored stack is distinguished from one that is not, whatever else is wrong with it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tests.registration.moving_heads import Moving, as_slices, simulated, slices
 
 @pytest.fixture(scope="module")
 def mirrored(head: Phantom) -> list[SimulatedStack]:
-    """The stacks of the head with left and right swapped, at the same places."""
+    """The stacks of the head with left and right swapped, in the same places."""
     assert np.allclose(
         head.affine[:3, 3], -head.affine[:3, :3] @ (np.array(head.t2.shape) - 1) / 2
-    )  # x = 0 is its middle
+    )  # x = 0 is the middle of the grid
     return simulated(replace(head, t2=head.t2[::-1], mask=head.mask[::-1]))
 
 
@@ -48,7 +48,7 @@ def test_the_mirrored_one_of_three_is_found(
     of_stacks = found([mirrored[n] if n == which else one for n, one in enumerate(still)], mm=mm)
     assert np.argmin(of_stacks) == which
     assert of_stacks[which] < MIRRORED_BELOW
-    assert min(one for n, one in enumerate(of_stacks) if n != which) > 0.05  # as without it
+    assert min(one for n, one in enumerate(of_stacks) if n != which) > 0.05  # as without the mirrored stack
 
 
 def test_of_two_each_is_the_mirror_image_of_the_other(
@@ -78,7 +78,7 @@ def test_nothing_is_said_of_a_stack_that_shows_something_else(still: list[Simula
 
 
 def test_what_the_others_saw_on_one_side_alone_is_no_mirror_image(still: list[SimulatedStack]) -> None:
-    """Beyond their last slice their volume is zero, and a pixel is more like the other side."""
+    """Beyond the last slice of the others their volume is zero, which makes pixels resemble the other side more."""
     slices = as_slices(still)[0]
     across = np.abs(slices.planes.rotation[:, 0, 2]) > 0.9  # sagittal slices
     first = slices.stack_id == slices.stack_id[~across][0]
@@ -129,7 +129,7 @@ def test_a_mirror_image_is_called_so_where_the_others_show_that_the_head_has_sid
 
 @pytest.mark.parametrize("spread", [0.0, 0.6])
 def test_slices_that_do_not_agree_say_less(spread: float) -> None:
-    """The standard error is that of leaving out each slice in turn, and grows with their disagreement."""
+    """The standard error comes from leaving out each slice in turn, and grows with their disagreement."""
     rng, n_slices = np.random.default_rng(0), 12
     plane = np.repeat(np.arange(n_slices), 200)
     here, mirrored, noise = rng.normal(size=(3, len(plane)))

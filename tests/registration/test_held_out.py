@@ -25,7 +25,7 @@ from tests.registration.moving_heads import Moving, as_slices, simulated, slices
 def test_true_poses_predict_better_than_wrong_ones(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ) -> None:
-    """The further off, the higher the cost; the wrong stack correlates least."""
+    """The cost grows with the error, and the wrong stack has the lowest correlation."""
     slices, truth = still_slices
     right = held_out_score(slices, samples, truth)
     assert min(p.correlation for p in right.prediction) > 0.75
@@ -63,7 +63,7 @@ def test_a_few_slices_that_went_astray_do_not_count_in_the_agreement(
     assert without == score.correlations
     weight[astray] = 0.1
     assert score.agreements(samples, weight)[1] > without[1] + 0.01
-    # where many do not count, all of them tell
+    # if many slices would not count, all are used
     weight[rows[::2]] = 0.1
     assert score.agreements(samples, weight)[1] == without[1]
 
@@ -108,7 +108,7 @@ def test_the_true_initialisation_is_chosen(moving: Moving) -> None:
 
 
 def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose]) -> None:
-    """A volume made without a stack does not depend on it."""
+    """A volume made without a stack does not depend on that stack."""
     slices, _ = still_slices
     volume, grid = volume_without(slices, 1, 3.2)
     brighter = slices.value.copy()
@@ -130,7 +130,7 @@ def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom) -> 
 
 
 def test_the_fine_correlation_asks_only_where_others_saw(still_slices: tuple[Slices, RigidPose]) -> None:
-    """Zeros of what two of three stacks did not see say nothing of poses; closing the hole is no better than truth."""
+    """Zeros in the part unseen by two of three stacks are no evidence: closing the hole scores no better than truth."""
     slices, _ = still_slices
     place = np.abs(slices.slice_index - np.median(slices.slice_index))
     holed = slices.take((slices.stack_id == 0) | (place > 2))
@@ -157,7 +157,7 @@ def test_a_stack_of_which_others_saw_nothing_correlates_by_zero(still_slices: tu
 def test_the_profile_of_thin_slices_is_left_out_of_coarse_volumes(
     still_slices: tuple[Slices, RigidPose], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Interpolation between voxels blurs more. That of thick slices counts."""
+    """Interpolation between voxels blurs more than a thin profile; the profile of thick slices is used."""
     slices, truth = still_slices
     posed = slices.with_motion(truth)
 

@@ -1,4 +1,4 @@
-"""A stack of another head is told by what the others gain without it, even where it fits as well as they do."""
+"""Intruders: a stack of another head is found by the gain of the others without it, even if it fits equally well."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def fitted(slices: Slices) -> FittedSlices:
 
 
 def noisy(slices: Slices) -> Slices:
-    """So noisy that no slice fits as those in place do."""
+    """Stacks so noisy that no slice fits as well as usual slices in place."""
     noise = np.random.default_rng(0).normal(0, 0.15, slices.value.shape)
     return replace(slices, value=(slices.value + noise).astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""A stack that does not fit the others is left out, and only then."""
+"""A stack is left out if, and only if, it does not fit the others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.registration.test_quality import QUICK, noise_instead
 
 GOOD, FAILED = StackQuality(True, 0.8, 0.95, 0.0), StackQuality(False, 0.3, 0.8, 0.0)
 UNLIKE = StackQuality(True, 0.8, 0.85, 0.0)
-MIRRORED = replace(GOOD, handedness=-0.1)  # as one of two may be
+MIRRORED = replace(GOOD, handedness=-0.1)  # possible for one of two stacks
 
 
 def with_noise(still: list[SimulatedStack], place: int) -> list[SimulatedStack]:
@@ -107,7 +107,7 @@ def test_all_stay_where_the_others_would_not_check_each_other(
 
 
 def test_the_registration_serves_for_all_stacks_again(still: list[SimulatedStack]) -> None:
-    """As `reconstruct(stacks, registration)` has it: the slices of the stack that was left out are not expected."""
+    """`reconstruct(stacks, registration)` does not expect slices of the stack that was left out."""
     slices, _ = as_slices(with_noise(still, 2))
     found = register_robustly(slices, QUICK)
     assert len(with_pixels_of(slices, found).slices) == len(found.slices)
@@ -116,7 +116,7 @@ def test_the_registration_serves_for_all_stacks_again(still: list[SimulatedStack
 
 
 def as_registered(moving: Moving, calls: list[int] | None = None) -> Callable[..., Registration]:
-    """Registration that takes no time: any slices are where they are."""
+    """Replace registration by one that keeps all slices in place and takes no time."""
 
     def register_(slices: Slices, *others: Any, **options: Any) -> Registration:
         if calls is not None:

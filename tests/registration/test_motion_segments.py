@@ -1,4 +1,4 @@
-"""The cheapest sequence of motions in time: against brute force, and on planted jerks."""
+"""The cheapest sequence of motions in time: against brute force, and with planted jerks."""
 
 import itertools
 
@@ -56,7 +56,7 @@ def test_the_distance_is_that_of_a_ball() -> None:
 
 
 def test_the_distance_does_not_depend_on_where_the_head_is() -> None:
-    """A turn about the head's own centre moves it by the turn alone."""
+    """A rotation about the head's own centre moves it by the rotation alone."""
     turn = Rotation.from_rotvec([0, 0, 0.4]).as_matrix()
     near, far = (
         head_distance_mm(RigidPose.identity(1), RigidPose(turn[None], (c - turn @ c)[None]), c)[0, 0]
@@ -79,7 +79,7 @@ def lattice(n: int) -> RigidPose:
 def planted(
     interleave: int, truth_in_time: np.ndarray, n_states: int = 5, depth: float = 40.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Costs [K, J] that are noisy and lowest for the true candidate, and that candidate [K] by slice."""
+    """Noisy costs [K, J] that are lowest for the true candidate, and the true candidate [K] of each slice."""
     n = len(truth_in_time)
     rng = np.random.default_rng(interleave)
     truth = np.empty(n, int)
@@ -110,11 +110,11 @@ def test_the_cost_is_that_of_the_slices_and_of_the_changes() -> None:
 def test_one_slice_that_says_little_does_not_leave_its_run() -> None:
     cost, _ = planted(1, np.full(24, 2))
     cost[7] = 3.0
-    cost[7, 0] = 0.0  # a spoilt slice: slightly better elsewhere
+    cost[7, 0] = 0.0  # a damaged slice that fits slightly better elsewhere
     segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
     assert (segments.choice == 2).all()
     assert segments.n_segments == 1
-    assert segments.interleave == 1  # the first of equals
+    assert segments.interleave == 1  # the first of equally good ones
 
 
 def test_missing_slices_do_not_break_the_interleave() -> None:
@@ -126,7 +126,7 @@ def test_missing_slices_do_not_break_the_interleave() -> None:
 
 
 def test_kept_candidates_are_considered_and_others_only_where_promising() -> None:
-    """One motion that is never among the best of a window can be the best compromise."""
+    """A motion that is never among the best of a window can be the best compromise."""
     orders = time_orders(np.arange(24))
     windows = [order[first : first + 5] for order in orders.values() for first in range(20)]
     cost = np.full((24, 6 * len(windows) + 1), 30.0)
@@ -160,6 +160,6 @@ def test_changes_cost_more_the_further_they_go_and_none_costs_nothing() -> None:
     penalties = [transition_penalty(np.array([0.0, d, 0])) for d in (0.01, 1.0, 4.0, 20.0, 80.0)]
     assert penalties == sorted(penalties)
     assert penalties[0] == pytest.approx(CHANGE_PENALTY, abs=0.01)
-    assert penalties[-1] < 2 * penalties[-2]  # heavy-tailed: a jerk is possible
+    assert penalties[-1] < 2 * penalties[-2]  # heavy-tailed, so that a jerk is possible
     two, one = transition_penalty(np.array([10.0, 10])), transition_penalty(np.array([20.0]))
     assert two > one

@@ -1,4 +1,4 @@
-"""The open shear in the motion of slices: found, weighed against random walks, and taken out without harm."""
+"""The open shear in the motion of slices: measured, compared with random walks, and removed without harm."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def walked(slices: Slices, interleave: int, seed: int, level: MotionLevel = WALK
 
 
 def apart_mm(one: Slices, other: Slices) -> float:
-    """Root mean square distance of slices' middles after a rigid motion."""
+    """Root mean square distance of slice centres after a rigid motion."""
     common = fit_rigid(one.planes.center_mm, other.planes.center_mm)
     moved = common.apply(one.planes.center_mm)
     return float(np.sqrt(((moved - other.planes.center_mm) ** 2).sum(-1).mean()))
@@ -45,7 +45,7 @@ def test_the_strain_in_a_motion_is_found(amount: float) -> None:
     assert found is not None
     strain = open_strain(mean_normals(still(2)))
     assert strain is not None
-    same = np.sign(np.vdot(found.strain, strain))  # the sign of a strain is nobody's
+    same = np.sign(np.vdot(found.strain, strain))  # the sign of a strain is arbitrary
     assert found.amount * same == pytest.approx(amount, rel=0.02)
 
 
@@ -62,7 +62,7 @@ def test_a_walk_has_as_much_of_it_as_is_said(interleave: int) -> None:
     found = [motion_shear(walked(still(2), interleave, seed), [interleave] * 2) for seed in range(40)]
     amounts, likely = np.array([[one.amount, one.likely] for one in found if one is not None]).T
     assert len(amounts) == 40
-    # the median of what each motion says of itself, since the square of a variance's estimate is skewed
+    # the median over the motions, because the estimate of a variance is skewed
     assert 0.6 < np.sqrt((amounts**2).mean()) / np.median(likely) < 1.6
 
 

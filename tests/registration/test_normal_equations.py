@@ -28,7 +28,7 @@ def smooth_volume() -> np.ndarray:
 
 
 def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
-    """Planes well inside the grid; pixels with a gain and noise of their own."""
+    """Planes well inside the grid, with random gains and pixel noise."""
     rng = np.random.default_rng(seed)
     spacing = np.full((n, 2), 1.3)
     planes = Planes(
@@ -53,7 +53,7 @@ def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
         thickness_mm=np.full(n, 3.0),
         header_pose=planes.pose,
     )
-    # not at the optimum, where the gradient would vanish
+    # away from the optimum, where the gradient would vanish
     start = RigidPose(
         planes.rotation @ rotation_matrix(rng.normal(0, 0.05, (n, 3))), planes.center_mm + rng.normal(0, 0.5, (n, 3))
     )
@@ -61,7 +61,7 @@ def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
 
 
 def stepped(pose: RigidPose, gain: np.ndarray, parameter: int, size: float) -> tuple[RigidPose, np.ndarray]:
-    """Body-frame turn (0-2), body-frame shift (3-5) or log-gain (6) of every slice."""
+    """Change of every slice's rotation (0-2) or translation (3-5) in its own frame, or of its log-gain (6)."""
     change = np.zeros((len(pose), 7))
     change[:, parameter] = size
     turned = pose.rotation @ rotation_matrix(change[:, :3])
@@ -95,7 +95,7 @@ def test_gradient_and_hessian_against_finite_differences(width: float) -> None:
         of_slice = slices.pixel_plane == k
         j, f = derivative[of_slice], factor[of_slice]
         gradient, hessian = j.T @ (f * residual[of_slice]), j.T @ (f[:, None] * j)
-        # volumes are float32; a step of 1e-6 seldom crosses a voxel's border, where the derivative jumps
+        # volumes are float32; a step of 1e-6 rarely crosses a voxel border, where the derivative jumps
         assert np.linalg.norm(equations.gradient[k] - gradient) < 1e-4 * np.linalg.norm(gradient)
         assert np.linalg.norm(equations.hessian[k] - hessian) < 1e-4 * np.linalg.norm(hessian)
 
@@ -143,7 +143,7 @@ def test_losses_are_those_of_the_equations() -> None:
 
 
 def test_equations_of_many_pixels_are_sums_of_those_of_some() -> None:
-    """A slice of more pixels than a run has, and the same slice in two parts."""
+    """A slice with more pixels than a run of the loop, and the same slice in two parts."""
     small, gain = make_slices(6)
     shape = np.full((4, 2), 40)
     planes = replace(small.planes, shape=shape, spacing_mm=np.full((4, 2), 0.4))

@@ -1,4 +1,4 @@
-"""Which strain of the head the slices of two orientations leave open."""
+"""The open strain of the head that slices of two orientations leave undetermined."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_one_and_three_orientations_do_not_leave_one_strain(normals: list[np.nda
 
 
 def slices_along(*normals: np.ndarray, wobble_deg: float = 0.0) -> Any:
-    """Stacks of 40 slices each, of which only the orientation is known; slices tilt either way about the mean."""
+    """Stacks of 40 slices each with given orientation; slices tilt to both sides of the mean."""
     rotation, stack_id = [], []
     for stack, normal in enumerate(normals):
         turn = Rotation.align_vectors(normal[None], Z[None])[0]

@@ -25,7 +25,7 @@ def test_uniform_rotations_are_rotations_that_cover_the_sphere(rng: np.random.Ge
     nearest = np.array([angle_deg(rotation, one).min() for one in asked])
     assert nearest.max() < 20
     assert np.median(nearest) < 11
-    # no two of them say the same
+    # no two of them are equal
     assert min(np.partition(angle_deg(rotation, one), 1)[1] for one in rotation[::40]) > 5
 
 
@@ -55,7 +55,7 @@ def test_perturbed_keeps_what_it_was_given_and_spreads_as_stated(rng: np.random.
     assert len(found) == 3 * 2001
     np.testing.assert_array_equal(found.rotation[:3], given.rotation)
     np.testing.assert_array_equal(found.translation_mm[:3], given.translation_mm)
-    for k in range(3):  # in blocks, each around its own
+    for k in range(3):  # in blocks, each around its own centre
         block = found.take(np.arange(3 + 2000 * k, 3 + 2000 * (k + 1)))
         turn = Rotation.from_matrix(block.rotation @ given.rotation[k].T).as_rotvec(degrees=True)
         shift = block.apply(np.tile(CENTER_MM, (2000, 1))) - given.apply(np.tile(CENTER_MM, (3, 1)))[k]

@@ -1,4 +1,4 @@
-"""Slices of a single stack move towards the prior where that explains them better."""
+"""Slices of a single stack are moved to the prior if it then explains them better."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_slices_in_line_stay_there_against_a_prior_that_says_nothing_new(head: P
 def test_a_stack_takes_its_length_from_its_header_and_not_from_the_prior(
     head: Phantom, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A prior volume that is a little longer pulls slices apart, which nothing else would undo."""
+    """A slightly longer prior volume pulls slices apart, which no other term would undo."""
     slices, _ = as_slices(simulated(head, STILL, n_stacks=1))
     normal = slices.header_pose.rotation[0, :, 2]
     axis = int(np.argmax(np.abs(normal)))

@@ -1,4 +1,4 @@
-"""Stacks that are not registered are called unreliable, good ones are not; few slices are down-weighted."""
+"""Quality: stacks that are not registered are unreliable, good ones are not; few slices are down-weighted."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ def qualities(stacks: list[SimulatedStack]) -> list[StackQuality]:
 
 
 def noise_instead(one: SimulatedStack) -> SimulatedStack:
-    """The same masks and brightness, and nothing of the head."""
+    """Stacks with the same masks and brightness but noise instead of the head."""
     rng = np.random.default_rng(0)
     image = one.stack.image.copy()
     image[one.stack.mask] = rng.permutation(image[one.stack.mask])
@@ -77,7 +77,7 @@ def test_a_stack_of_another_head_is_not_reliable(still: list[SimulatedStack]) ->
 
 
 def test_stacks_left_far_apart_are_not_reliable(head: Phantom, moving: Moving) -> None:
-    """Severe motion that nobody undoes: that is said, stack by stack, with names and figures."""
+    """Uncorrected severe motion is reported for each stack, with names and figures."""
     estimate = register(moving.slices, replace(QUICK, n_rounds=0))
     found = stack_qualities(estimate, 3)
     assert not any(one.reliable for one in found)
@@ -139,7 +139,7 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
 
 @pytest.mark.parametrize(("share", "reliable"), [(1.0, True), (0.5, False)])
 def test_a_good_fit_counts_where_others_saw_the_stack(share: float, reliable: bool) -> None:
-    """Alone it would agree with itself."""
+    """Where no other stack covers, a stack would only be compared with itself."""
     estimate = estimate_with([0.8, 0.8], [IN_PLACE_NCC] * 2, [1.0] * 2, [0, 1])
     estimate.overlap = SimpleNamespace(stack_share=[1.0, share], correlation=[0.9, MIN_OVERLAP_CORRELATION - LEEWAY])
     assert [one.reliable for one in stack_qualities(estimate, 2)] == [True, reliable]
@@ -162,7 +162,7 @@ def test_of_two_stacks_one_may_be_a_mirror_image_and_both_are_reliable(still: li
     estimate = estimate_with([0.8, 0.8], [0.95] * 2, [1.0] * 2, [0, 2])
     estimate.handedness = [0.2, MIRRORED_BELOW - 0.01]
     found = stack_qualities(estimate, 3)
-    assert [one.reliable for one in found] == [True, False, True]  # the second has no slices
+    assert [one.reliable for one in found] == [True, False, True]  # the second stack has no slices
     (line,) = pose_warnings(estimate, found, [one.stack for one in still])[1:]
     assert line.startswith(f"{still[2].stack.name}: may be a mirror image of what the other stack shows")
 
@@ -175,7 +175,7 @@ def test_a_stack_is_one_too_many_where_no_other_failed(ncc: float, reliable: lis
 
 
 def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[SimulatedStack]) -> None:
-    """The figures are those of the stacks that have slices, whatever their numbers."""
+    """Figures belong to the stacks that have slices, whatever their numbers."""
     estimate = estimate_with([0.7, 0.9], [0.95] * 4, [1.0] * 4, [0, 0, 2, 2])
     found = stack_qualities(estimate, 3)
     assert [one.held_out_correlation for one in found] == [0.7, None, 0.9]

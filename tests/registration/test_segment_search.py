@@ -1,4 +1,4 @@
-"""Motion segments of all stacks: jerks are undone, rigid stacks stay in one piece."""
+"""Motion segments of all stacks: jerks are corrected, rigid stacks keep one motion."""
 
 import numpy as np
 
@@ -26,14 +26,14 @@ from tests.registration.moving_heads import (
 
 
 def upside_down(slices: Slices, stack: int) -> RigidPose:
-    """Motions [K] of which one stack's turn it by 180 degrees about the middle of the head."""
+    """Motions [K] that rotate one stack by 180 degrees about the centre of the head."""
     middle = slices.planes.pixel_world_mm(slices.pixel_index).mean(0)
     by = turned_about(middle, np.array([np.pi, 0, 0]), np.array([3.0, -2, 4]))
     return stack_moved(RigidPose.identity(len(slices)), slices, stack, by)
 
 
 def jerked(slices: Slices, stack: int, by: RigidPose) -> tuple[RigidPose, np.ndarray]:
-    """Motions [K] of which the second half in time (interleave 2) of a stack's are others, and which."""
+    """Motions [K] that differ in the second half in time (interleave 2) of one stack, and the slices of that half."""
     late = (slices.stack_id == stack) & (slices.slice_index % 2 == 1)
     motion = RigidPose.identity(len(slices))
     after = by @ motion
@@ -57,7 +57,7 @@ def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving) ->
         [head_distance_mm(back.take([k]), truth.take([k]), np.zeros(3))[0, 0] for k in range(len(slices))]
     )
     assert np.median(distance[~few]) < 1
-    # relative motions are those of the other
+    # relative motions are unchanged
     np.testing.assert_allclose(
         (back.inverse().take([0]) @ back.take([7])).rotation,
         (other.inverse().take([0]) @ other.take([7])).rotation,
@@ -68,7 +68,7 @@ def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving) ->
 def test_half_a_stack_is_placed_again_after_a_jerk(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ) -> None:
-    """A wrongly placed segment is corrected, with nothing known about which segment is wrong."""
+    """A misplaced segment is corrected without knowing which segment is wrong."""
     slices, _ = still_slices
     by = turned_about(np.zeros(3), np.deg2rad([0, 12, 8]), np.array([4.0, 3, -5]))
     motion, late = jerked(slices, 1, by)
@@ -121,7 +121,7 @@ def test_segments_need_a_gain_and_a_volume_that_shows_the_head(head: Phantom) ->
     one, is_rigid = rigid_or_segments(slices, sample, own, 2, volume, grid, min_cost_gain=np.inf)
     gain = predict(sample, one, volume, grid, 2).cost - in_segments.cost
     assert is_rigid
-    assert gain > MIN_SINGLE_GAIN_PER_SAMPLE * sample.pixels.n_samples  # far more than a single stack needs
+    assert gain > MIN_SINGLE_GAIN_PER_SAMPLE * sample.pixels.n_samples  # far more than the threshold of a single stack
     for limits, expected in (
         ({"min_cost_gain": 0.9 * gain}, False),
         ({"min_cost_gain": 1.1 * gain}, True),
@@ -157,7 +157,7 @@ def test_a_stack_that_starts_upside_down_comes_back(
 
 
 def test_severe_motion_is_undone(moving: Moving) -> None:
-    """Headers 16 mm off, four jerks of 15 degrees in each stack, slices that lost their signal."""
+    """Headers are 16 mm off, each stack has four jerks of 15 degrees, and some slices have dropouts."""
     before = pixel_errors_mm(moving.slices, moving.truth)
     after = pixel_errors_mm(moving.estimate.slices, moving.truth)
     assert np.median(before) > 15

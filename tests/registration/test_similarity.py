@@ -1,4 +1,4 @@
-"""How well slices fit under candidate motions, against plain numpy and scipy."""
+"""Costs of slices under candidate motions, against plain numpy and scipy."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ CENTER_MM = np.array([10.0, -20.0, 30.0])
 
 
 def few_slices(n: int = 7) -> Slices:
-    """Slices of unlike sizes and masks with random values, in arbitrary poses."""
+    """Slices of different sizes and masks with random values, in arbitrary poses."""
     rng = np.random.default_rng(5)
     shape = rng.integers(3, 40, (n, 2))
     planes = Planes(
@@ -89,7 +89,7 @@ def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too() -> None:
 def plain_moments(
     pixels: SearchPixels, volume: np.ndarray, grid: VolumeGrid, motion: RigidPose, order: int = 1
 ) -> np.ndarray:
-    """The six sums by scipy, trilinear or from the nearest voxel; outside of the voxels' centres the volume is 0."""
+    """The six sums by scipy, trilinear or nearest-neighbour; the volume is 0 outside the voxel centres."""
     out = np.zeros((len(motion), len(pixels), 6))
     for j in range(len(motion)):
         moved = pixels.point_mm @ motion.rotation[j].T + motion.translation_mm[j]

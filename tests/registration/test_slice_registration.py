@@ -1,4 +1,4 @@
-"""Slices registered to a volume, one by one."""
+"""Registration of single slices to a volume."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Rounds of volume and slices: what is in place stays there."""
+"""Rounds of volume and slices: slices in place stay there."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from tests.registration.moving_heads import as_slices, off_mm, pixel_errors_mm, 
 def test_slices_in_place_stay_there(still: list[SimulatedStack]) -> None:
     slices, truth = as_slices(still)
     found = refine_slices(slices, RegistrationSettings(n_rounds=7, finest_voxel_mm=1.8)).slices
-    # 0.67 mm where the volume ends at the masks and most rounds are coarse
+    # it was 0.67 mm when the volume ended at the masks and most rounds were coarse
     assert np.median(pixel_errors_mm(found, truth)) < 0.45
 
 

@@ -1,4 +1,4 @@
-"""Stack-to-stack registration, and how consistent a stack is with itself."""
+"""Stack-to-stack registration, and self-consistency of a stack."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Slices that went astray are found again; those that fit, and those that show nothing, are left alone."""
+"""Slices astray are found again; slices that fit, and slices without content, are not searched."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture
 def astray(still_slices: tuple[Slices, RigidPose]) -> tuple[Slices, np.ndarray]:
-    """Three stacks with a jerk during two slices that follow each other in time (every second one is taken first)."""
+    """Three stacks with a jerk during two slices that are consecutive in time (interleave 2)."""
     slices = still_slices[0]
     middle = int(np.median(slices.slice_index[slices.stack_id == STACK]))
     at = np.flatnonzero((slices.stack_id == STACK) & np.isin(slices.slice_index, [middle, middle + 2]))
@@ -39,7 +39,7 @@ def test_slices_of_one_jerk_are_found_again(
     found, n_found = find_strays(slices, np.ones(len(slices)), weight, np.ones(len(slices)), rng())
     assert n_found == len(at)
     assert off_mm(slices, still_slices[0])[at].min() > 8
-    assert off_mm(found, still_slices[0])[at].max() < 4.0  # the slices are as thick
+    assert off_mm(found, still_slices[0])[at].max() < 4.0  # the slice thickness
     others = np.delete(np.arange(len(slices)), at)
     assert np.array_equal(found.planes.pose.rotation[others], slices.planes.pose.rotation[others])
     assert np.array_equal(found.planes.pose.translation_mm[others], slices.planes.pose.translation_mm[others])
@@ -60,7 +60,7 @@ def test_slices_with_all_their_weight_are_searched_where_they_are_unlike_the_vol
 def test_a_stack_that_is_unlike_the_volume_as_a_whole_is_not_searched(
     still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]
 ) -> None:
-    """With most of its slices gone there is no volume in which they could be found."""
+    """With most slices astray there is no volume in which they could be found."""
     slices, at = astray
     ones, own = np.ones(len(slices)), np.flatnonzero(slices.stack_id == STACK)
     for share, expected in ((0.4, True), (0.6, False)):

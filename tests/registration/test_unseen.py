@@ -1,4 +1,4 @@
-"""What no stack saw is no evidence; spans of a single stack keep the length of the header."""
+"""Unseen parts: they are not evidence for poses, and spans of a single stack keep the length of the header."""
 
 import numpy as np
 import pytest
@@ -16,13 +16,13 @@ from g3r.registration.unseen import TemplateFill, coverage_share, sampled, with_
 
 
 def upper_halves_gone(slices: Slices) -> Slices:
-    """Every stack without the second half of its slices."""
+    """Slices without the second half of every stack."""
     kept = [rows[: len(rows) // 2] for n in range(3) for rows in [np.flatnonzero(slices.stack_id == n)]]
     return slices.take(np.concatenate(kept))
 
 
 def the_head(slices: Slices) -> TemplateFill:
-    """The head itself as template: a volume of all its slices."""
+    """The head itself as template: a volume of all slices."""
     volume, grid = volume_without(slices, -1, 3.2)
     return TemplateFill(volume, grid, slices.planes.pixel_world_mm(slices.pixel_index).mean(0))
 
@@ -65,7 +65,7 @@ def test_sampled_is_zero_outside() -> None:
     assert sampled(volume, grid, np.array([[2.0, 0, 0], [1.0, 0, 0], [9.0, 0, 0]])).tolist() == [4, 2, 0]
 
 
-def test_overlap(still_slices: tuple[Slices, RigidPose]) -> None:
+def test_half_stacks_overlap_in_part_and_correlate_at_true_poses(still_slices: tuple[Slices, RigidPose]) -> None:
     slices = still_slices[0]
     halves = upper_halves_gone(slices)
     whole = overlap_of(slices, StackSamples.of_all(slices), RigidPose.identity(len(slices)))
@@ -83,7 +83,7 @@ def test_overlap(still_slices: tuple[Slices, RigidPose]) -> None:
 
 @pytest.fixture
 def holed(still_slices: tuple[Slices, RigidPose]) -> Slices:
-    """One stack that lacks four slices in its middle."""
+    """One stack without four slices in its middle."""
     slices = still_slices[0].take(still_slices[0].stack_id == 0)
     middle = len(slices) // 2
     return slices.take(np.setdiff1d(np.arange(len(slices)), np.arange(middle - 2, middle + 2)))

@@ -1,4 +1,4 @@
-"""A headless Chromium over its debugging pipe: no driver and no package is needed, and it has no network."""
+"""A headless Chromium over its debugging pipe, without a driver or package, and without network."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COMMAND_SECONDS = 60.0
 
 
 def chromium() -> str | None:
-    """The browser on this machine; None where there is none, or where pipes are not passed on (Windows)."""
+    """The browser on this machine; None if there is none, or if pipes cannot be inherited (Windows)."""
     return None if sys.platform == "win32" else next(filter(None, map(shutil.which, NAMES)), None)
 
 
@@ -46,7 +46,7 @@ class Page:
     """One page of the browser.
 
     Attributes:
-        requests: addresses that it asked for.
+        requests: addresses that it requested.
         complaints: errors and warnings of its console, and errors of its scripts.
     """
 
@@ -75,14 +75,14 @@ class Page:
                 return found["result"]
 
     def open(self, path: Path, width: int = 1400, height: int = 900) -> None:
-        """Open a file and wait until its viewer stands."""
+        """Open a file and wait until its viewer is ready."""
         self.resize(width, height)
         self.command("Page.navigate", url=path.as_uri())
         self.wait("document.readyState === 'complete' && (document.getElementById('viewer').dataset.ready === 'true')")
         self.wait("true", 0.6)
 
     def resize(self, width: int, height: int) -> None:
-        """Give the window a size in pixels."""
+        """Set the size of the window in pixels."""
         self.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
                      mobile=False)  # fmt: skip
 
@@ -101,7 +101,7 @@ class Page:
             time.sleep(0.1)
 
     def click(self, selector: str) -> None:
-        """Click the middle of an element with the mouse."""
+        """Click the centre of an element with the mouse."""
         self.evaluate(f"document.querySelector({selector!r}).scrollIntoView({{block: 'center'}})")
         box = self.box(selector)
         at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2, "button": "left", "clickCount": 1}
@@ -110,11 +110,11 @@ class Page:
         self.wait("true", 0.6)
 
     def box(self, selector: str) -> dict[str, float]:
-        """Where an element is in the window."""
+        """Position and size of an element in the window."""
         return self.evaluate(f"document.querySelector({selector!r}).getBoundingClientRect().toJSON()")
 
     def picture(self, selector: str | None = None, *, whole: bool = False) -> Image.Image:
-        """What is seen: of an element, of the window, or of the whole page."""
+        """Screenshot of an element, of the window, or of the whole page."""
         parameters: dict[str, Any] = {}
         if selector:
             box, scroll = self.box(selector), self.evaluate("window.scrollY")
@@ -124,7 +124,7 @@ class Page:
         return Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
 
     def pixels(self, selector: str) -> np.ndarray:
-        """The same of an element as numbers [H, W, 3], whole: it is brought into the window."""
+        """Screenshot of a whole element as an array [H, W, 3], after scrolling it into the window."""
         self.evaluate(f"document.querySelector({selector!r}).scrollIntoView({{block: 'center'}})")
         self.wait("true", 0.3)
         return np.asarray(self.picture(selector), dtype=float)
@@ -150,11 +150,11 @@ class Page:
 
 @contextmanager
 def browser(profile: Path, *flags: str) -> Iterator[Page]:
-    """A browser with one page, which ends with the block.
+    """A browser with one page for the duration of the block.
 
     Args:
-        profile: an empty folder for it.
-        flags: beside `FLAGS`.
+        profile: an empty folder for its profile.
+        flags: further ones besides `FLAGS`.
     """
     program = chromium()
     assert program is not None, "ask `chromium()` first"

@@ -1,4 +1,4 @@
-"""One output folder for all tests of the report: a small result whose headers name a patient."""
+"""Output folder shared by the report tests: a small result of stacks whose headers name a patient."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.faults.test_no_leaks import CANARY, planted
 
 @pytest.fixture(scope="session")
 def planted_stacks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two stacks, their masks beside them, with a name in every field of the headers and of the folder."""
+    """Two stacks and their masks, with a name in every header field and in the folder's name."""
     folder = tmp_path_factory.mktemp("data") / CANARY
     folder.mkdir()
     for n in range(2):
@@ -26,7 +26,7 @@ def planted_stacks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="session")
 def finished(planted_stacks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What g3r-infer wrote of them, in a folder with a space in its name."""
+    """Their output folder of g3r-infer, with a space in its name."""
     folder = tmp_path_factory.mktemp("results") / "one run"
     masks = [path.with_name(path.name.replace("stack", "mask")) for path in planted_stacks]
     line = ["--stacks", *planted_stacks, "--masks", *masks, "--preset", "fast", "--no-prior", "--resolution", "3"]

@@ -1,4 +1,4 @@
-"""The table in docs/report.md of all that a verdict may say: `python -m tests.report.messages_table` writes it."""
+"""Table of all verdict messages in docs/report.md: `python -m tests.report.messages_table` writes it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FILLED_IN = {
 }
 
 GOOD = {"stack mirrored": MIRRORED_BELOW, "perhaps mirrored": MIRRORED_BELOW, "stacks parallel": MIN_CROSSING_DEG}
-"""Limits; of the others that of the agreement."""
+"""Limits of messages; the others use the limit of the agreement."""
 
 LINES = {
     "unseen too much": f"N % of the brain was not seen by any slice (N ml) ..., above {100 * DO_NOT_USE_ABOVE:.0f} %; "
@@ -45,11 +45,11 @@ LINES = {
     "left out": "it does not fit the other stacks (what is bad of it, and what is good)",
     "warning": "any other warning of the run, as `run.json` has it",
 }
-"""Of messages whose text comes from elsewhere."""
+"""Texts of messages that are made elsewhere."""
 
 
 def table() -> str:
-    """A row for each message, the worst first."""
+    """The table: a row for each message, the worst first."""
     rows = []
     for word in (DO_NOT_USE, CHECK, USE):
         for name, message in MESSAGES.items():

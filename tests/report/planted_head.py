@@ -1,4 +1,4 @@
-"""A head with a bright blob in its right, anterior, superior part, and in which corner of a picture that shows."""
+"""A head with a bright blob in its right, anterior, superior part, and the corner of a picture that shows it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIDES = {
     "coronal": {"left": "R", "right": "L", "top": "S", "bottom": "I"},
     "sagittal": {"left": "A", "right": "P", "top": "S", "bottom": "I"},
 }
-"""Of each section as radiologists read it: what lies on each side of the picture."""
+"""Anatomical sides of the picture of each section in radiological convention."""
 
 DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "A": (0, 1, 0), "P": (0, -1, 0), "S": (0, 0, 1), "I": (0, 0, -1)}
 EXTENTS_MM = np.array([80, 100, 70])
@@ -28,7 +28,7 @@ CENTER_MM = np.array([5.0, -7.0, 3.0])
 
 
 def grid_of(axes: str) -> VolumeGrid:
-    """The grid of one head, stored with these axes: "LPS" where the first index grows to the left, and so on."""
+    """The grid of one head stored with the given axes, such as "LPS" if the first index grows to the left."""
     directions = np.column_stack([DIRECTIONS[letter] for letter in axes]).astype(float)
     n_i, n_j, n_k = (np.abs(directions.T) @ EXTENTS_MM / SPACING_MM).astype(int).tolist()
     affine = np.eye(4)
@@ -38,7 +38,7 @@ def grid_of(axes: str) -> VolumeGrid:
 
 
 def blob(grid: VolumeGrid) -> NDArray[np.float32]:
-    """Bright towards right, anterior and superior of the middle [I, J, K], big enough for the three planes there."""
+    """A bright blob [I, J, K] right, anterior and superior of the centre, large enough to cross the three planes."""
     place = grid.world(np.moveaxis(np.indices(grid.shape), 0, -1))
     half_mm = np.abs(grid.affine[:3, :3]) @ (np.array(grid.shape) - 1) / 2
     away = (place - grid.center_mm) / half_mm - 0.4
@@ -46,14 +46,14 @@ def blob(grid: VolumeGrid) -> NDArray[np.float32]:
 
 
 def brain(grid: VolumeGrid) -> NDArray[np.bool_]:
-    """All of a grid but its outermost voxels."""
+    """Mask of a grid without its outermost voxels."""
     inside = np.zeros(grid.shape, dtype=bool)
     inside[1:-1, 1:-1, 1:-1] = True
     return inside
 
 
 def with_planted_head(finished: Path, folder: Path, axes: str) -> Path:
-    """A copy of an output folder that shows this head, stored with these axes, and nothing else."""
+    """A copy of an output folder that shows only this head, stored with the given axes."""
     shutil.copytree(finished, folder)
     for path in folder.glob("*.nii.gz"):
         path.unlink()
@@ -64,12 +64,12 @@ def with_planted_head(finished: Path, folder: Path, axes: str) -> Path:
 
 
 def section_of(picture: str) -> NDArray[np.floating]:
-    """Grey values of a PNG given as base64."""
+    """Grey values of a base64-encoded PNG."""
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(picture))).convert("L")).astype(float)
 
 
 def bright_corner(pixels: NDArray[np.floating]) -> str:
-    """Where the bright part of a picture [H, W] lies, such as "top left"; "middle" stands for neither side."""
+    """Corner of a picture [H, W] with the bright part, such as "top left"; "middle" means neither side."""
     rows, columns = np.nonzero(pixels > 200)
     assert len(rows) > 0.03 * pixels.size, "there is no blob in the picture"
     down, across = rows.mean() / pixels.shape[0] - 0.5, columns.mean() / pixels.shape[1] - 0.5

@@ -1,4 +1,4 @@
-"""Records of runs as run.json holds them, with whatever went wrong."""
+"""Records of runs as in run.json, with chosen faults."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def unseen(share: float = 0.0, *, usable: bool = True, extent_known: bool = True
 
 
 def record(*stacks: StackRecord, **facts: Any) -> RunRecord:
-    """The record of a run of these stacks, three good ones by default; `facts` are further fields."""
+    """The record of a run of the given stacks, by default three good ones; `facts` are further fields."""
     found = list(stacks) or [stack(f"stack-{n}.nii.gz") for n in range(3)]
     qualities = [one.quality for one in found if one.quality]
     registration = RegistrationRecord(

@@ -1,4 +1,4 @@
-"""The page in a real browser without a network: nothing is asked for, pictures are there, buttons work."""
+"""The page in a real browser without network: no requests, visible pictures, working buttons."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KINDS = {"webgl": (SOFTWARE_WEBGL, "#webgl canvas"), "plain": (NO_WEBGL, "#plane
 def shown(
     request: pytest.FixtureRequest, finished: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Page, str, str]]:
-    """The page, the kind of viewer it must have, and the element with the picture."""
+    """The page, its expected kind of viewer, and the element with the picture."""
     flags, element = KINDS[request.param]
     with browser(tmp_path_factory.mktemp("profile"), *flags) as page:
         page.open(finished / "report.html")
@@ -83,7 +83,7 @@ def test_nothing_sticks_out_sideways(shown: tuple[Page, str, str], width: int) -
 
 
 def test_no_request_and_no_complaint(shown: tuple[Page, str, str]) -> None:
-    """Last, so that all that was clicked counts."""
+    """This test runs last, so that it covers all earlier clicks."""
     page = shown[0]
     page.wait("true", 0.5)
     assert {address.split(":")[0] for address in page.requests} <= {"file", "data", "blob"}

@@ -1,4 +1,4 @@
-"""report.html: whole, small, closed to the outside, without the patient, and written by run and command alike."""
+"""report.html: complete, small, without external requests or patient data, written by the run and by the command."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from g3r.report.verdict_messages import MESSAGES
 MAX_BYTES = 10_000_000
 
 NIIVUE_SHA256 = "47b896b77ec4a5be3ef1949c33ad393b6f45629921f326c279000bcf51bdb4af"
-"""Of dist/niivue.umd.js in @niivue/niivue 0.69.0."""
+"""SHA-256 of dist/niivue.umd.js in @niivue/niivue 0.69.0."""
 
 
 def embedded(text: str) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def test_the_name_is_nowhere_not_even_packed(text: str, finished: Path) -> None:
     words = [b"DOE^", b"JANE", b"pytest-of", str(finished.parent).encode()]
     packed = [image.to_bytes() for image in images(text).values()]
     packed += [base64.b64decode(one) for one in re.findall(r"data:image/png;base64,([^\"]+)", text)]
-    # the viewer is not of this project, and letters that stand for bytes spell all sorts of words
+    # the viewer is third-party code, and base64 text contains short words by chance
     own = text.replace((files("g3r.report") / "page" / "niivue.umd.js").read_text(encoding="utf-8"), "")
     own = re.sub(r"[A-Za-z0-9+/]{200,}={0,2}", "", own)
     assert len(own) < len(text) / 2
@@ -88,7 +88,7 @@ def test_the_copies_show_what_the_files_hold(text: str, finished: Path) -> None:
     box = tuple(slice(a, a + n) for a, n in zip(first, copy.shape, strict=True))
     whole, cropped = volume.get_fdata(), copy.get_fdata()
     np.testing.assert_allclose(cropped, whole[box], atol=np.abs(whole).max() / 4000)
-    assert whole.sum() == pytest.approx(whole[box].sum(), rel=1e-6)  # nothing of it lies outside
+    assert whole.sum() == pytest.approx(whole[box].sum(), rel=1e-6)  # the box contains all of it
     assert copy.get_data_dtype() == np.int16
     assert all(found[name].get_data_dtype() == np.uint8 for name in ("mask", "uncertainty", "density", "prior"))
 

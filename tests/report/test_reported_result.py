@@ -1,4 +1,4 @@
-"""`result.report()`: the verdict as text, in a notebook, and as a page; arrays that know where they are."""
+"""`result.report()`: the verdict as text, in a notebook, and as a page; arrays with their grid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.report.planted_head import SIDES, blob, brain, bright_corner, section
 
 @pytest.fixture(scope="module")
 def result(subject: Path) -> ReportedResult:
-    """Of a run of a second."""
+    """The result of a run of about a second."""
     stacks = [load_stack(subject / f"stack-{n}.nii.gz", subject / f"mask-{n}.nii.gz") for n in range(3)]
     return GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
 
@@ -32,7 +32,7 @@ def test_the_verdict_is_the_one_of_terminal_and_page(result: ReportedResult) -> 
     assert lines[0].startswith(f"{report.verdict.word}: ")
     assert len(lines) == 1 + len(report.verdict.reasons)
     assert repr(report) == str(report)
-    assert any("thickness" in line for line in lines)  # no sidecar said it
+    assert any("thickness" in line for line in lines)  # no sidecar states the thickness
 
 
 def test_a_notebook_shows_it_with_pictures(result: ReportedResult) -> None:
@@ -46,7 +46,7 @@ def test_a_notebook_shows_it_with_pictures(result: ReportedResult) -> None:
 
 
 def test_its_pictures_are_as_radiologists_read_them(result: ReportedResult) -> None:
-    """The patient's right, and the front, are on the left, whatever the volume's axes."""
+    """The patient's right, and anterior, are on the left of the picture for any axes of the volume."""
     planted = replace(result, volume=blob(result.grid), mask=brain(result.grid))
     assert isinstance(planted, ReportedResult)
     sections = planted.report().sections

@@ -1,4 +1,4 @@
-"""Left is where the letters say: the pictures of the page, and both viewers in a real browser."""
+"""Sides agree with their letters in the pictures of the page and in both viewers in a real browser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LETTERS_OF_PLANE = """Array.from(document.querySelectorAll('#planes .plane:nth-c
   return [one.textContent, (box.x + box.width / 2 - frame.x) / frame.width,
           (box.y + box.height / 2 - frame.y) / frame.height];
 })"""
-"""Each with its place from the left and the top of the picture, 0 to 1."""
+"""Script that returns each letter with its position from the left and the top of the picture, 0 to 1."""
 
 WATCH_NIIVUE = """(function () {
   var kind = niivue.Niivue.prototype, scene = kind.drawScene, text = kind.drawText;
@@ -38,11 +38,11 @@ TILES = """window.drawnBy.screenSlices.map(function (one) {
   return [one.axCorSag].concat(Array.from(one.leftTopWidthHeight));
 })"""
 NIIVUE_PLANES = ("axial", "coronal", "sagittal")
-"""By its numbers."""
+"""Names of the planes by NiiVue's numbers."""
 
 
 def test_the_blob_is_one_sided() -> None:
-    """Seen from the front it is where the tests below expect it, and a mirrored one is elsewhere."""
+    """The blob lies where the tests below expect it, and a mirrored one lies elsewhere."""
     seen = blob(grid_of("RAS"))
     axial = seen[::-1, ::-1, seen.shape[2] // 2].T
     assert bright_corner(axial * 2.5) == "top left"
@@ -52,7 +52,7 @@ def test_the_blob_is_one_sided() -> None:
 
 @pytest.mark.parametrize("axes", ["RAS", "LAS", "LPS", "PSR"])
 def test_static_sections(axes: str, finished: Path, tmp_path: Path) -> None:
-    """Of files whose headers say it in any way."""
+    """For files with any order and direction of axes."""
     text = report_html(with_planted_head(finished, tmp_path / "run", axes))
     found = SECTION.findall(text)
     assert [name for name, _ in found] == list(SIDES)
@@ -62,7 +62,7 @@ def test_static_sections(axes: str, finished: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def page_of_head(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a volume that is stored from right to left and from front to back."""
+    """The page of a volume that is stored from right to left and from front to back."""
     folder = with_planted_head(finished, tmp_path_factory.mktemp("planted") / "run", "LPS")
     return write_report(folder)
 
@@ -73,7 +73,7 @@ def opened(page: Page, path: Path, kind: str) -> None:
 
 
 def side_at(across: float, down: float) -> str:
-    """Of a picture, where something is at this share of its width and height."""
+    """Side of a picture for a position given as a share of its width and height."""
     near = {"left": across, "right": 1 - across, "top": down, "bottom": 1 - down}
     side = min(near, key=lambda name: near[name])
     assert near[side] < 0.15
@@ -94,11 +94,11 @@ def test_the_plain_viewer(page_of_head: Path, tmp_path: Path) -> None:
 
 @in_a_browser
 def test_the_viewer_with_webgl(page_of_head: Path, tmp_path: Path) -> None:
-    """NiiVue draws three tiles in one canvas, and in the corner of each what lies to its left and at its top."""
+    """NiiVue draws three tiles in one canvas, with the letters of the left and top sides on each."""
     with browser(tmp_path, *SOFTWARE_WEBGL) as page:
         opened(page, page_of_head, "webgl")
         page.evaluate(WATCH_NIIVUE)
-        page.click("[data-layer=volume]")  # draws it again
+        page.click("[data-layer=volume]")  # redraws it
         pixels = page.pixels("#webgl canvas").mean(-1)
         scale = pixels.shape[1] / page.evaluate("document.querySelector('#webgl canvas').width")
         tiles = {NIIVUE_PLANES[int(kind)]: box for kind, *box in page.evaluate(TILES)}

@@ -1,4 +1,4 @@
-"""Motion as the page draws it: signs, millimetres, degrees and names of axes; slices in the order of time."""
+"""Motion plot of the page: signs, millimetres, degrees and names of axes; slices in the order of time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from g3r.report.slice_rows import SliceRows
 from tests.report.records import record, stack
 
 CENTER_MM = np.array([10.0, -20.0, 30.0])
-"""Of the head in the volume's space."""
+"""Centre of the head in the volume's space."""
 
 MEANS = {"scanner": RigidPose.identity(1), "standard": RigidPose.from_rotvec([[0.3, -0.8, 1.2]], [[15.0, -4.0, 8.0]])}
-"""What takes points of the scanner to the volume's space, on average."""
+"""Mean motion from the scanner's to the volume's space."""
 
 SHIFT_MM, TURN_DEG = np.array([3.0, -2.0, 1.0]), 10.0
-"""To the right, backwards and up."""
+"""Shift to the right, backwards and up."""
 
 RIGHT, ANTERIOR, SUPERIOR = np.eye(3)
 TURNS = {
@@ -35,7 +35,7 @@ TURNS = {
     "roll (about anterior)": (ANTERIOR, SUPERIOR, RIGHT),
     "yaw (about superior)": (SUPERIOR, ANTERIOR, -RIGHT),
 }
-"""A positive turn: its axis, a landmark seen from the head's centre, and where that goes."""
+"""Positive rotations: axis, a landmark relative to the head's centre, and the direction in which it moves."""
 
 
 def rows_of(motion: RigidPose) -> SliceRows:
@@ -47,7 +47,7 @@ def rows_of(motion: RigidPose) -> SliceRows:
 
 
 def record_of(mean: RigidPose | None) -> RunRecord:
-    """Of a run in standard space, or in the scanner's where there is no mean motion."""
+    """The record of a run in standard space, or in scanner space without a mean motion."""
     one = record()
     matrix = None
     if mean is not None:
@@ -62,14 +62,14 @@ def record_of(mean: RigidPose | None) -> RunRecord:
 @pytest.mark.parametrize("space", MEANS)
 @pytest.mark.parametrize("name", TURN_AXES)
 def test_a_head_that_moved_in_one_slice(name: str, space: str) -> None:
-    """Of three slices the second saw it shifted and turned; its motion takes what it saw to the volume."""
+    """The second of three slices saw the head shifted and rotated; its motion maps its pixels to the volume."""
     axis, landmark, goes = TURNS[name]
     mean = MEANS[space]
-    center = mean.inverse().apply(CENTER_MM[None])[0]  # where the head's centre usually lies in the scanner
+    center = mean.inverse().apply(CENTER_MM[None])[0]  # the mean position of the head's centre in the scanner
     turn = Rotation.from_rotvec(TURN_DEG * axis, degrees=True).as_matrix()
     assert (turn @ landmark) @ goes > 0.1, "the turn goes the other way"
 
-    # the slice met a point of the head at x' = turn (x - center) + center + shift, and x belongs into the volume
+    # the slice saw a point of the head at x' = turn (x - center) + center + shift, and x is its place in the volume
     back = RigidPose(turn.T[None], (center - turn.T @ (center + SHIFT_MM))[None])
     usual = center + 40 * landmark
     met = turn @ (usual - center) + center + SHIFT_MM
@@ -83,9 +83,9 @@ def test_a_head_that_moved_in_one_slice(name: str, space: str) -> None:
 
 
 def test_slices_in_the_order_of_time() -> None:
-    """Stack after stack, each by its own interleaving, whatever the order of the table."""
+    """Stack after stack, each by its own interleave, for any order of the table."""
     interleaves = (3, None, 2)
-    numbers = (range(7), range(5), range(3, 9))  # the last one's first slices show no brain
+    numbers = (range(7), range(5), range(3, 9))  # the first slices of the last stack show no brain
     stacks = [replace(stack(f"{n}.nii.gz"), interleave=step) for n, step in enumerate(interleaves)]
     keys = [(n, number) for n, those in enumerate(numbers) for number in those]
     np.random.default_rng(0).shuffle(keys)
@@ -105,7 +105,7 @@ def test_slices_in_the_order_of_time() -> None:
 
 
 def test_the_page_draws_it_with_its_name(finished: Path, tmp_path: Path) -> None:
-    """One slice saw the head 4 mm to the right: that line alone goes up, where the slice was acquired."""
+    """One slice saw the head 4 mm to the right: only that line rises, at the time of the slice."""
     folder = shutil.copytree(finished, tmp_path / "run")
     plain = json.loads((folder / "run.json").read_text())
     plain["registration"]["standard_from_scanner"] = None
@@ -118,7 +118,7 @@ def test_the_page_draws_it_with_its_name(finished: Path, tmp_path: Path) -> None
     for row in table:
         row |= dict.fromkeys(("rx", "ry", "rz", "tx", "ty", "tz"), "0") | {"weight": "1"}
     moved = first[1]
-    moved["tx"] = "-4"  # from where the header has it to where it belongs
+    moved["tx"] = "-4"  # motion from the header's place to the right place
     text = "\n".join("\t".join(row[name] for name in SLICE_COLUMNS) for row in table)
     (folder / "slices.tsv").write_text(f"{head}\n{text}\n")
 

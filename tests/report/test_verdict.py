@@ -1,4 +1,4 @@
-"""The verdict: what leads to which word, and in which order."""
+"""The verdict: its word for each fault, and the order of its reasons."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def oriented(best: float, rival: float) -> RunRecord:
 
 
 def crossing(angle_deg: float) -> RunRecord:
-    """Two stacks whose slices cross at that angle, with the warning that a run would have."""
+    """Two stacks whose slices cross at the given angle, with the warning of a run."""
     found = record(stack("a.nii"), stack("b.nii"))
     assert found.registration is not None
     registration = replace(found.registration, crossing_deg=angle_deg)

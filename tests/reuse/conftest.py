@@ -1,4 +1,4 @@
-"""A finished run for the tests of this folder."""
+"""A finished run, shared by the tests of this folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.reuse.runs import reconstruct
 
 @pytest.fixture(scope="session")
 def finished(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output folder of a quick run of the small subject, with a prior whose grid is another than the volume's."""
+    """Output folder of a quick run of the small subject, with a prior on a grid that differs from the volume's."""
     folder = tmp_path_factory.mktemp("finished") / "run"
     reconstruct(subject, folder)
     return folder
@@ -22,13 +22,13 @@ def finished(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def run(finished: Path) -> FinishedRun:
-    """The same, read."""
+    """The finished run, read from its folder."""
     return FinishedRun.load(finished)
 
 
 @pytest.fixture(scope="session")
 def exported(subject: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its slices with their poses, as NeSVoR has them; tests do not write to it."""
+    """Its slices with their poses in the format of NeSVoR; tests must not write to it."""
     out = tmp_path_factory.mktemp("exported") / "nesvor"
     stacks = [str(path) for path in files(subject, "stack")]
     assert export_poses([str(finished), "--format", "nesvor", "--stacks", *stacks, "--output", str(out)]) == 0

@@ -1,4 +1,4 @@
-"""Quick runs, and what is known about the small subject that they are of."""
+"""Quick runs of the small subject, and its truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def read(path: Path) -> NDArray[np.float32]:
 
 
 def truth_from_run(subject: Path, finished: Path) -> RigidPose:
-    """The motion that takes the run's space to that of the truth, by the true poses."""
+    """The motion from the run's space to the truth's, by the true poses."""
     points = slice_points(files(subject, "mask"))
     return target_registration_error(
         points, read_poses(subject / "poses.tsv"), read_poses(finished / "slices.tsv")
@@ -54,7 +54,7 @@ def label_truth(subject: Path, path: Path) -> Path:
 
 
 def label_stacks(subject: Path, truth: Path, folder: Path) -> list[Path]:
-    """Label maps on the grids of the stacks: what is in the middle of each slice, by the true poses."""
+    """Label maps on the grids of the stacks, sampled at the slice centres by the true poses."""
     labels, table = load_volume(truth), read_poses(subject / "poses.tsv")
     paths = []
     for n, stack in enumerate(files(subject, "stack")):
@@ -72,7 +72,7 @@ def label_stacks(subject: Path, truth: Path, folder: Path) -> list[Path]:
 
 
 def _sampled(volume: Volume, pose: RigidPose, grid: VolumeGrid) -> NDArray[np.float32]:
-    """Nearest values of a volume at the points of a grid after a motion."""
+    """Nearest-neighbour values of a volume at the points of a grid after a motion."""
     points = pose.apply(grid.world(np.argwhere(np.ones(grid.shape)))[None])[0]
     return map_coordinates(volume.data, volume.grid.index(points).T, order=0).reshape(grid.shape)
 

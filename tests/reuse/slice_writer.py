@@ -1,4 +1,4 @@
-"""Folders of slices for tests: an ellipsoid with a pattern, cut by stacks whose slices have poses of their own."""
+"""Folders of slices for tests: an ellipsoid with a pattern, cut by stacks whose slices have individual poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SAGITTAL = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]).T
 def poses(
     frame: NDArray[np.float64], n_slices: int, rng: np.random.Generator, *, deg: float = 3.0, mm: float = 1.0
 ) -> list[NDArray[np.float64]]:
-    """Affines [4, 4] of parallel slices about the origin, each moved a little.
+    """Affines [4, 4] of parallel slices about the origin, each slightly moved.
 
     Args:
         frame: [3, 3] columns are the axes of the image; the third may be left-handed.
@@ -43,7 +43,7 @@ def poses(
 
 
 def seen(affine: NDArray[np.float64], shape: tuple[int, int] = SHAPE) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Image and mask [I, J] of the head where a slice lies."""
+    """Image and mask [I, J] of the head at the pose of a slice."""
     index = np.stack([*np.indices(shape), np.zeros(shape), np.ones(shape)], axis=-1)
     world = index @ affine[:3].T
     inside = ((world / HALF_MM) ** 2).sum(-1) < 1
@@ -58,7 +58,7 @@ def write_slice(
     image: NDArray[np.generic] | None = None,
     mask: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Write N.nii.gz, and mask_N.nii.gz where there is a mask; the head is shown where no image is given.
+    """Write N.nii.gz, and mask_N.nii.gz if there is a mask; without an image, the head is shown.
 
     Args:
         folder: made where it is not there.
@@ -76,7 +76,7 @@ def write_slice(
 
 
 def write_stack(folder: Path, affines: list[NDArray[np.float64]], first: int = 0, *, masks: bool = True) -> None:
-    """Write slices with consecutive numbers, cropped to different shapes as other programs do.
+    """Write slices with consecutive numbers, cropped to different shapes as by other programs.
 
     Args:
         folder: made where it is not there.
@@ -94,7 +94,7 @@ def write_stack(folder: Path, affines: list[NDArray[np.float64]], first: int = 0
 
 
 def write_three(folder: Path, rng: np.random.Generator, *, masks: bool = True) -> list[int]:
-    """Write an axial, a coronal (left-handed) and a sagittal stack one after the other; returns how many slices each.
+    """Write an axial, a coronal (left-handed) and a sagittal stack in turn; returns the number of slices of each.
 
     Args:
         folder: made where it is not there.

@@ -1,4 +1,4 @@
-"""`g3r-infer --slices`: exported poses in place of a search, and the way back to the frame of the files."""
+"""`g3r-infer --slices`: given poses instead of a search, and the transform back to the frame of the files."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from tests.reuse.runs import truth_from_run
 QUICK = tuple(word for word in WITH_THICKNESS if word not in ("--thickness", "4"))
 
 ELSEWHERE = RigidPose.from_rotvec([[0.5, -0.8, 0.3]], [[40.0, -70.0, 25.0]])
-"""Where the slices of the test are, from the frame of the run that they are of."""
+"""Motion from the frame of the finished run to that of the test's slices."""
 
 MAX_LOSS_DB = 0.3
-"""Of the volume of given poses against that of the run that found them; 0.3 more was seen, since it fits again."""
+"""Accepted PSNR loss with given poses against the run that found them; a gain of 0.3 was seen, from the second fit."""
 
 
 @pytest.fixture(scope="module")
 def moved(exported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The exported slices in a frame of their own, as another tool might have them, without an index."""
+    """The exported slices in another frame and without an index, as from another tool."""
     folder = tmp_path_factory.mktemp("moved")
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = ELSEWHERE.rotation[0], ELSEWHERE.translation_mm[0]
@@ -52,7 +52,7 @@ def moved(exported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def again(moved: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output folder of a run of the moved slices, like `finished` in all else."""
+    """Output folder of a run of the moved slices, with the other settings of `finished`."""
     folder = tmp_path_factory.mktemp("again") / "out"
     options = ("--preset", "fast", "--resolution", "1.2", "--threads", "1", "--quiet")
     assert main(["--slices", str(moved), *options, "--output", str(folder)]) == 0
@@ -67,7 +67,7 @@ def in_truth(subject: Path, finished: Path, points_mm: NDArray[np.float64], name
 
 
 def psnr(subject: Path, finished: Path, folder: Path, to_finished: RigidPose) -> float:
-    """PSNR (dB) of a run's volume against the truth; its points are first taken to the space of the finished run."""
+    """PSNR (dB) of a run's volume against the truth, after its points are mapped to the space of the finished run."""
     volume = load_volume(folder / "volume.nii.gz")
     points = to_finished.apply(volume.grid.world(np.argwhere(np.ones(volume.data.shape)))[None])[0]
     truth, mask = (
@@ -82,20 +82,20 @@ def test_every_output_is_there(again: Path) -> None:
 
 
 def test_the_volume_is_as_good_as_that_of_the_run_and_leads_back(subject: Path, finished: Path, again: Path) -> None:
-    """By the recorded motion, which takes it back to the frame of the slice files."""
+    """The recorded motion maps the volume back to the frame of the slice files."""
     recorded = FinishedRun.load(again).standard_from_scanner
     assert recorded is not None
     before = psnr(subject, finished, finished, RigidPose.identity(1))
     after = psnr(subject, finished, again, ELSEWHERE.inverse() @ recorded.inverse())
     assert before > 18
     assert after > before - MAX_LOSS_DB
-    # and the head is in standard orientation again, which is known to some degrees
+    # the head is in standard orientation again, which is accurate to a few degrees
     turn = recorded @ ELSEWHERE
     assert np.rad2deg(Rotation.from_matrix(turn.rotation[0]).magnitude()) < 12
 
 
 def test_slices_in_standard_orientation_stay(exported: Path, run: FinishedRun) -> None:
-    """The volume of poses from standard space lies where that of their run does."""
+    """A volume from poses in standard space has the place of the volume of their run."""
     stacks, given = read_slice_folder(exported)
     slices, _ = normalised_slices(stacks)
     found = measure(slices, given, PRESETS["preview"].registration, template=PoseModel.load(None).template)
@@ -147,7 +147,7 @@ def test_the_slices_go_out_again_with_their_last_poses(
         first, last = (nib.Nifti1Image.from_filename(folder / f"{k}.nii.gz") for folder in folders)
         np.testing.assert_array_equal(np.asarray(first.dataobj), np.asarray(last.dataobj))
         np.testing.assert_allclose(last.affine, affine, atol=1e-4)
-    # those of the index have other places: the same slices by other numbers
+    # the folder with an index does not match: its slices have other places and other numbers
     shutil.rmtree(tmp_path / "out")
     capsys.readouterr()
     assert export_poses([*words, str(exported)]) == 3
@@ -156,7 +156,7 @@ def test_the_slices_go_out_again_with_their_last_poses(
 
 
 def test_poses_that_are_wrong_are_noticed(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A stack 12 mm and 20 degrees from where it belongs: what is measured says that stacks do not agree."""
+    """With a stack 12 mm and 20 degrees off, the measured quality says that stacks do not agree."""
     shutil.copytree(exported, tmp_path / "in")
     wrong = np.eye(4)
     wrong[:3, :3], wrong[:3, 3] = Rotation.from_rotvec([0, 0.35, 0]).as_matrix(), [12, 0, 0]

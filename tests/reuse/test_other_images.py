@@ -1,4 +1,4 @@
-"""Other contrasts and label maps in the poses of a run, against their own truth."""
+"""Other contrasts and label maps reconstructed with the poses of a run, against their own truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.reuse.runs import dice, label_stacks, label_truth, read, truth_on
 
 @pytest.fixture(scope="module")
 def echo(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same slices in another contrast (dark where the first is bright), and its truth."""
+    """The same slices in an inverted contrast, and its truth."""
     folder = tmp_path_factory.mktemp("echo")
     truth, mask = load_volume(subject / "truth.nii.gz"), subject / "truth-mask.nii.gz"
     inverted = np.clip(1300 - truth.data, 0, None) ** 1.5 * (load_volume(mask).data > 0)
@@ -30,7 +30,7 @@ def echo(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["--volume", folder / "contrast.nii.gz", "--mask", mask, "--output", folder / "case"]
     words += ["--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
     assert simulate([str(word) for word in words]) == 0
-    np.testing.assert_allclose(poses(folder / "case"), poses(subject), atol=1e-4)  # the same head, moving the same way
+    np.testing.assert_allclose(poses(folder / "case"), poses(subject), atol=1e-4)  # the same head with the same motion
     return folder / "case"
 
 
@@ -59,8 +59,8 @@ def test_a_second_contrast_comes_out_as_well_as_the_first(
         scores(volumes["own"], subject),
         scores(finished / "volume.nii.gz", subject),
     )
-    # 17.90 dB and 0.878; own contrast, in the same way 21.40 dB and 0.897, with Gaussians and prior 22.03 dB and 0.912.
-    # The inverted contrast varies more over its range: the same correlation is fewer dB
+    # 17.90 dB and 0.878; the run's contrast by the same method 21.40 dB and 0.897, by the full fit 22.03 dB and 0.912.
+    # The inverted contrast varies more over its range, so the same correlation gives fewer dB
     assert echo_db > 17
     assert echo_ncc > own_ncc - 0.03
     assert run_db > own_db
@@ -90,13 +90,13 @@ def test_labels_are_fused(subject: Path, finished: Path, run: FinishedRun, tmp_p
     fused, expected = read(out), truth_on(run.geometry.grid, subject, finished, truth)
     assert set(np.unique(fused)) == {0, 1, 2, 7}
     found = {label: dice(fused == label, expected == label) for label in (1, 2, 7)}
-    # 0.974, 0.975 and, for the ball, 0.945; all of the brain 0.982
+    # measured: 0.974, 0.975 and, for the ball, 0.945; for the whole brain 0.982
     assert min(found.values()) > 0.93
     assert dice(fused > 0, expected > 0) > 0.97
 
 
 def test_the_pixels_are_those_that_the_run_used(subject: Path, run: FinishedRun) -> None:
-    """Values at positions: cut and enlarged slices alike take the pixel that the header puts there."""
+    """For cropped and padded slices, each pixel is the one that the header puts at its position."""
     images = load_images(run, files(subject, "stack"))
     for margin in (0, 4, 1000):
         slices = slices_of(run.geometry, images, margin)
@@ -111,7 +111,7 @@ def test_the_pixels_are_those_that_the_run_used(subject: Path, run: FinishedRun)
 
 
 def test_stacks_with_another_slice_axis_are_turned(subject: Path, finished: Path, run: FinishedRun) -> None:
-    """The grid in the file of a stack whose slices are along its first axis."""
+    """The file grid of a stack with slices along its first axis."""
     stack = run.geometry.stacks[0]
     turned = type(stack)(stack.grid, FileAxes(0)).in_file()
     assert turned.shape == (stack.grid.shape[2], *stack.grid.shape[:2])

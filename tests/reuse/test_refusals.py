@@ -1,4 +1,4 @@
-"""What the commands on a finished run refuse: one line, exit code 3, and nothing written."""
+"""Refusals of the commands on a finished run: one line, exit code 3, and nothing written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Damage = Callable[[Path], object]
 
 @pytest.fixture
 def copy(finished: Path, tmp_path: Path) -> Path:
-    """The run, to be damaged."""
+    """A copy of the run, to be damaged."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 

@@ -1,4 +1,4 @@
-"""A finished run on other grids: on its own it is the run's volume."""
+"""Rendering of a finished run on other grids; on its own grid it gives the run's volume."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from tests.reuse.runs import dice, read, reconstruct
 
 
 def largest_difference(folder: Path) -> float:
-    """Of the rendered volume from the written one, over its range."""
+    """Largest difference of the rendered from the written volume, relative to its range."""
     run, written = FinishedRun.load(folder), read(folder / "volume.nii.gz")
     return float(np.abs(render_volume(run, target_grid(run).evaluated) - written).max() / np.ptp(written))
 
 
 def test_on_its_own_grid_it_is_the_volume(finished: Path, run: FinishedRun) -> None:
-    assert run.geometry.grid.shape != run.geometry.prior_grid.shape  # else half of the mixture is not tested
+    assert run.geometry.grid.shape != run.geometry.prior_grid.shape  # otherwise half of the mixture would not be tested
     assert 0 < run.record.prior_weight < 1
-    assert run.record.edge_by_image  # nor is that of the masks alone
+    assert run.record.edge_by_image  # the edge by the image is used, not that of the masks
     assert largest_difference(finished) < 1e-6
 
 
@@ -58,7 +58,7 @@ def test_a_finer_grid_holds_the_same_head(finished: Path, run: FinishedRun, tmp_
     np.testing.assert_allclose(fine.grid.spacing_mm, 0.6, rtol=1e-6)
     inside = read(finished / "mask.nii.gz") > 0
     at_voxels = on_grid(fine.data, fine.grid, run.geometry.grid, outside=0.0)
-    # trilinear reading blurs a little, so values agree and are not the same
+    # trilinear interpolation blurs slightly, so values agree only approximately
     assert np.corrcoef(at_voxels[inside], volume.data[inside])[0, 1] > 0.999
 
 
@@ -100,7 +100,7 @@ def test_a_left_handed_grid_and_one_far_away(finished: Path, run: FinishedRun, t
     flipped[:3, 3] = grid.world([grid.shape[0] - 1, 0, 0])
     written = read(finished / "volume.nii.gz")
     rendered = render_volume(run, VolumeGrid(grid.shape, flipped))[::-1]
-    # where a Gaussian is cut off, rounding decides: single voxels may differ by what is left of it there
+    # rounding decides where a Gaussian is cut off, so single voxels may differ by its remainder
     assert np.abs(rendered - written).max() < 1e-2 * np.ptp(written)
     assert np.median(np.abs(rendered - written)) < 1e-6 * np.ptp(written)
     far = np.eye(4)

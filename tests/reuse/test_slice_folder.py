@@ -1,4 +1,4 @@
-"""The folder of slices: out, and in again as NeSVoR reads it."""
+"""Export of the folder of slices, and reading as NeSVoR does."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def images(folder: Path, prefix: str = "") -> list[nib.Nifti1Image]:
 
 
 def middle_and_axes(image: nib.Nifti1Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A slice as NeSVoR takes it from a header: its middle (the third voxel axis has one voxel), and its frame."""
+    """Centre (the third axis has one voxel) and frame of a slice, as NeSVoR reads them from a header."""
     middle = nib.affines.apply_affine(image.affine, [(n - 1) / 2 for n in image.shape[:2]] + [0])
     return middle, image.affine[:3, :3] / image.header.get_zooms()
 
@@ -46,14 +46,14 @@ def test_the_slices_come_back_where_they_were(folder: Path, run: FinishedRun) ->
         np.testing.assert_allclose(middle, planes.center_mm[k], atol=TOLERANCE_MM)
         np.testing.assert_allclose(axes * reach_mm, planes.rotation[k] * reach_mm, atol=TOLERANCE_MM)
         np.testing.assert_allclose(image.header.get_zooms(), [1.5, 1.5, THICKNESS_MM], atol=1e-5)
-        assert np.linalg.det(image.affine[:3, :3]) > 0  # NeSVoR mirrors left-handed ones
+        assert np.linalg.det(image.affine[:3, :3]) > 0  # NeSVoR would mirror left-handed slices
         np.testing.assert_allclose(image.header.get_qform(), image.affine, atol=TOLERANCE_MM)
 
 
 def test_pixels_and_places_are_those_of_the_stack_after_its_motion(
     subject: Path, finished: Path, folder: Path, run: FinishedRun
 ) -> None:
-    """A pixel of the folder is the pixel of the stack that the header puts at x, and is at R x + t."""
+    """A pixel of the stack that the header puts at x is in the folder at R x + t."""
     stacks = [nib.Nifti1Image.from_filename(path) for path in files(subject, "stack")]
     table = read_poses(finished / "slices.tsv")
     with (folder / "index.tsv").open() as file:

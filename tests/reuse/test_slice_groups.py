@@ -1,4 +1,4 @@
-"""Which slices are of one stack, where no index says it."""
+"""Grouping of slices into stacks without an index."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Affine = NDArray[np.float64]
 
 
 def files(affines: list[Affine], numbers: list[int] | None = None) -> list[SliceFile]:
-    """Slices without pixels that matter."""
+    """Slice files with irrelevant pixel values."""
     rows = numbers or list(range(len(affines)))
     blank = np.zeros((30, 34), np.float32)
     return [
@@ -35,14 +35,14 @@ def numbers_of(groups: list[SliceGroup]) -> list[list[int]]:
 
 
 def shifted(affine: Affine, along: int) -> Affine:
-    """A slice moved along its normal by so many thicknesses."""
+    """A slice moved along its normal by a number of thicknesses."""
     moved = affine.copy()
     moved[:3, 3] += along * affine[:3, 2]
     return moved
 
 
 def turned(affine: Affine, deg: float, axis: int) -> Affine:
-    """A slice turned about one of its own axes through the origin of the world."""
+    """A slice rotated about one of its own axes through the origin of the world."""
     matrix = np.eye(4)
     normal = affine[:3, axis] / np.linalg.norm(affine[:3, axis])
     matrix[:3, :3] = Rotation.from_rotvec(np.deg2rad(deg) * normal).as_matrix()
@@ -64,7 +64,7 @@ def test_stacks_of_three_planes(mm: float, rng: np.random.Generator) -> None:
 
 
 def test_two_stacks_of_one_plane_begin_anew(rng: np.random.Generator) -> None:
-    """In the same direction, and the second one backwards."""
+    """Both stacks in the same direction, and the second one reversed."""
     first, second, third = (poses(AXIAL, n, rng) for n in (12, 10, 11))
     assert [len(group.files) for group in grouped([*first, *second, *third])] == [12, 10, 11]
     found = grouped([*first[::-1], *second[::-1]])
@@ -72,7 +72,7 @@ def test_two_stacks_of_one_plane_begin_anew(rng: np.random.Generator) -> None:
 
 
 def test_two_stacks_of_one_plane_turned_in_it(rng: np.random.Generator) -> None:
-    """Pixel axes differ by 90 degrees: a bias field in pixels could not be common."""
+    """Pixel axes differ by 90 degrees, so the stacks cannot share a bias field in pixels."""
     first = poses(AXIAL, 10, rng)
     second = [turned(one, 90, 2) for one in first]
     assert [len(group.files) for group in grouped([*first, *second])] == [10, 10]
@@ -92,7 +92,7 @@ def test_other_pixels_or_thickness_are_another_stack(rng: np.random.Generator) -
 
 @pytest.mark.parametrize("n_passes", [2, 3])
 def test_passes_of_an_interleaved_stack_are_one(n_passes: int, rng: np.random.Generator) -> None:
-    """Numbered as they were acquired; the order in space is found again."""
+    """Slices are numbered in order of acquisition, and their order in space is recovered."""
     affines = poses(CORONAL, 18, rng, deg=1, mm=0.2)
     order = [k for start in range(n_passes) for k in range(start, 18, n_passes)]
     (found,) = grouped([affines[k] for k in order])
@@ -101,7 +101,7 @@ def test_passes_of_an_interleaved_stack_are_one(n_passes: int, rng: np.random.Ge
 
 
 def test_a_stack_with_gaps_twice_is_no_interleaved_stack(rng: np.random.Generator) -> None:
-    """Both at the same places: nothing lies between the slices of the first."""
+    """Both passes have the same positions, so no slice lies between those of the first."""
     affines = poses(AXIAL, 18, rng, deg=0, mm=0)[::2]
     assert [len(group.files) for group in grouped([*affines, *affines])] == [9, 9]
 
@@ -111,13 +111,13 @@ def test_a_slice_that_went_astray_is_no_stack(at: int, rng: np.random.Generator)
     affines = poses(AXIAL, 12, rng)
     affines[at] = turned(affines[at], 70, 0)
     next_ones = poses(SAGITTAL, 9, rng)
-    # nothing before the first one says where the stack is
+    # no earlier slice shows where the stack is
     expected = [1, 11, 9] if at == 0 else [12, 9]
     assert [len(group.files) for group in grouped([*affines, *next_ones])] == expected
 
 
 def test_slices_that_were_left_out_leave_holes(rng: np.random.Generator) -> None:
-    """By their numbers, or by a jump where the rest was numbered anew."""
+    """Holes are found by missing numbers, or by a jump in position if the slices were renumbered."""
     affines = poses(AXIAL, 20, rng, deg=1, mm=0.3)
     kept = [k for k in range(20) if k not in (4, 9, 10, 11)]
     (by_number,) = grouped([affines[k] for k in kept], kept)
@@ -131,7 +131,7 @@ def test_slices_that_were_left_out_leave_holes(rng: np.random.Generator) -> None
 
 @pytest.mark.parametrize("deg", [0.0, 10.0])
 def test_motion_makes_no_hole(deg: float, rng: np.random.Generator) -> None:
-    """A jerk of four slices and back, and one that stays and turns the head."""
+    """A jerk of four slices and back, and one that lasts and rotates the head."""
     affines = poses(AXIAL, 24, rng, deg=1, mm=0.3)
     back = 24 if deg else 16
     jerk = [turned(shifted(one, 3), deg, 0) if 8 <= k < back else one for k, one in enumerate(affines)]

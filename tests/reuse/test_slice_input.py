@@ -1,4 +1,4 @@
-"""A folder of slices as input: what its files say comes back, pixel for pixel and to 1e-4 mm."""
+"""A folder of slices as input: pixels are preserved exactly, and positions to 1e-4 mm."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ TOLERANCE_MM = 1e-4
 
 
 def posed(found: SliceFolder) -> Slices:
-    """The slices of a folder in their poses, as a reconstruction takes them."""
+    """The slices of a folder in their poses, as used by a reconstruction."""
     slices = slices_from_stacks(found.stacks)
     return slices.with_motion(found.poses.motion_of(slices))
 
 
 def check_files(found: SliceFolder, slices: Slices) -> int:
-    """Hold every slice to its file: pixels, mask, and the places of the corners; returns how many there are."""
+    """Check every slice against its file: pixels, mask, positions of the corners; returns the number of slices."""
     planes = slices.planes
     for row in range(len(slices)):
         group = found.groups[slices.stack_id[row]]
@@ -49,7 +49,7 @@ def check_files(found: SliceFolder, slices: Slices) -> int:
 
 
 def n_usable(found: SliceFolder) -> int:
-    """Slices that show enough brain to be used."""
+    """Number of slices with enough brain to be used."""
     return sum(int(one.mask.sum()) >= MIN_SLICE_PIXELS for group in found.groups for one in group.files)
 
 
@@ -77,14 +77,14 @@ def test_an_exported_folder_comes_back(exported: Path, run: FinishedRun, tmp_pat
 
 
 def test_the_nominal_stacks_lie_where_their_slices_are(exported: Path) -> None:
-    """A slice moves little against its stack, and all of them together not at all."""
+    """A slice moves little relative to its nominal stack, and on average not at all."""
     found = load_slice_folder(exported)
     slices = posed(found)
     common = motion_to_headers(slices)
     np.testing.assert_allclose(common.translation_mm, 0, atol=1e-6)
     np.testing.assert_allclose(common.rotvec_rad(), 0, atol=1e-8)
     moved = slices.planes.pose.apply(slices.planes.corners_mm()) - slices.header_pose.apply(slices.planes.corners_mm())
-    assert np.median(np.linalg.norm(moved, axis=-1)) < 1.5  # the head moved as little; a pixel is 1.5 mm
+    assert np.median(np.linalg.norm(moved, axis=-1)) < 1.5  # about the motion of the head; a pixel is 1.5 mm
 
 
 @pytest.mark.parametrize("gap", ["left-handed", "holes", "stray"])
@@ -109,7 +109,7 @@ def test_odd_stacks_keep_their_poses(gap: str, tmp_path: Path, rng: np.random.Ge
     assert check_files(found, slices) == n_usable(found)
     assert gap != "stray" or 7 in slices.slice_index
     assert stack.image.shape[2] == 15
-    assert max(stack.image.shape[:2]) < 90  # a stray does not make a large image
+    assert max(stack.image.shape[:2]) < 90  # a slice astray does not enlarge the image
     assert stack.spacing_mm[2] == pytest.approx(3.0, abs=0.3)
     others = slices.take(slices.slice_index != 7)
     away_mm = np.linalg.norm(others.planes.center_mm - others.header_pose.translation_mm, axis=1)
@@ -118,7 +118,7 @@ def test_odd_stacks_keep_their_poses(gap: str, tmp_path: Path, rng: np.random.Ge
 
 def test_stacks_of_all_kinds_beside_each_other(tmp_path: Path, rng: np.random.Generator) -> None:
     counts = write_three(tmp_path / "slices", rng)
-    (tmp_path / "index.tsv").write_text("file\tquality\n0.nii.gz\tgood\n")  # somebody else's
+    (tmp_path / "index.tsv").write_text("file\tquality\n0.nii.gz\tgood\n")  # an index of another program
     found = load_slice_folder(tmp_path)
     assert [len(group.files) for group in found.groups] == counts
     assert check_files(found, posed(found)) == sum(
@@ -162,7 +162,7 @@ def test_a_stack_of_one_slice_and_one_without_brain(tmp_path: Path, rng: np.rand
     (tmp_path / "index.tsv").write_text("\n".join(["number\tstack\tslice", *lines]))
     found = load_slice_folder(tmp_path)
     assert [stack.name for stack in found.stacks] == ["stack-0", "stack-4"]
-    assert found.stacks[1].image.shape[2] == 2  # one of them blank
+    assert found.stacks[1].image.shape[2] == 2  # one of the two is blank
     check_files(found, posed(found))
     assert "stack-7: left out, all its masks are empty" in found.poses.notes
 

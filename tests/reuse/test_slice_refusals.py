@@ -1,4 +1,4 @@
-"""Folders of slices that cannot be used: one line that names the file, exit code 3, and nothing written."""
+"""Refusals of unusable slice folders: one line that names the file, exit code 3, and nothing written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGE, MASK = seen(AFFINES[5])
 
 
 def rewrite(folder: Path, name: str = "5", **changed: object) -> None:
-    """Write a slice again, with another image, mask or affine."""
+    """Rewrite a slice with another image, mask or affine."""
     write_slice(folder, name, **({"affine": AFFINES[5], "image": IMAGE, "mask": MASK} | changed))  # type: ignore[arg-type]
 
 
@@ -30,7 +30,7 @@ def sheared() -> np.ndarray:
 
 
 def raw_header(folder: Path, **fields: object) -> None:
-    """Write slice 5 with fields of its header set as they are."""
+    """Write slice 5 with raw header fields."""
     image = nib.Nifti1Image.from_filename(folder / "5.nii.gz")
     for name, value in fields.items():
         image.header[name] = value
@@ -42,7 +42,7 @@ def raw_header(folder: Path, **fields: object) -> None:
 
 
 def stack_of(folder: Path) -> None:
-    """A stack under the name of a slice."""
+    """A stack with the name of a slice."""
     nib.save(nib.Nifti1Image(np.repeat(IMAGE[:, :, None], 4, 2), AFFINES[5]), folder / "5.nii.gz")
 
 
@@ -51,7 +51,7 @@ def mask_of(folder: Path, mask: np.ndarray, affine: np.ndarray = AFFINES[5]) -> 
 
 
 def indexed(*lines: str) -> Callable[[Path], object]:
-    """Writes an index whose first line is that of ours, 0 to 10 as one stack where there is nothing else."""
+    """Write an index with our header line, by default with slices 0 to 10 as one stack."""
     rows = lines or tuple(f"{k}\t0\t{k}" for k in range(11))
     return lambda folder: (folder / "index.tsv").write_text("\n".join(["number\tstack\tslice", *rows]) + "\n")
 
@@ -116,7 +116,7 @@ def test_a_folder_that_cannot_be_used(name: str, tmp_path: Path) -> None:
     damage, expected = DAMAGES[name]
     write_stack(tmp_path, AFFINES)
     rewrite(tmp_path)
-    load_slice_folder(tmp_path)  # as it is, it can be used
+    load_slice_folder(tmp_path)  # the undamaged folder is usable
     damage(tmp_path)
     with pytest.raises(InputError) as caught:
         load_slice_folder(tmp_path)

@@ -1,4 +1,4 @@
-"""Poses in the files of other programs move points as slices.tsv does."""
+"""Poses in file formats of other programs move points like slices.tsv."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TOLERANCE_MM = 1e-6
 
 @pytest.fixture
 def points_mm(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A hundred points (RAS) as far out as a scanner reaches."""
+    """A hundred points (RAS) within the reach of a scanner."""
     return rng.uniform(-200, 200, (100, 3))
 
 
@@ -42,7 +42,7 @@ def name_of(key: tuple[int, int]) -> str:
 
 
 def dof_matrix(content: bytes) -> NDArray[np.float64]:
-    """The matrix [4, 4] of a rigid .dof, entry by entry as MIRTK sets it."""
+    """The matrix [4, 4] of a rigid .dof file, entry by entry as in MIRTK."""
     magic, kind, n_parameters, *parameters = struct.unpack(DOF_FORMAT, content)
     assert (magic, kind, n_parameters) == (0x000C6F9F, 2, 6)
     (cx, cy, cz), (sx, sy, sz) = (f(np.deg2rad(parameters[3:])) for f in (np.cos, np.sin))
@@ -78,7 +78,7 @@ def test_nitransforms_reads_them_alike(
     for k, key in enumerate(poses.keys):
         transform = linear.Affine.from_filename(folder / f"{name_of(key)}.tfm", fmt="itk")
         expected = poses.pose.take([k]).apply(points_mm[None])[0]
-        # it keeps matrices in float32, which has 2e-5 mm at 350 mm
+        # nitransforms keeps matrices in float32, which resolves 2e-5 mm at 350 mm
         np.testing.assert_allclose(transform.map(points_mm), expected, rtol=0, atol=1e-4)
 
 
@@ -104,20 +104,20 @@ def test_dof_moves_points_as_the_table_does(
 
 
 def test_dof_bytes_come_back(rng: np.random.Generator) -> None:
-    """Parameters of every size, in the order of the file: read as a matrix and written again."""
+    """Parameters of any size, in the order of the file, are read as a matrix and written again."""
     for _ in range(50):
         angles_deg = rng.uniform([-180, -89, -180], [180, 89, 180])
         content = struct.pack(DOF_FORMAT, 815007, 2, 6, *rng.uniform(-100, 100, 3), *angles_deg)
         assert len(content) == 60
         matrix = dof_matrix(content)
         again = dof_bytes(RigidPose(matrix[None, :3, :3], matrix[None, :3, 3]))
-        assert again[:36] == content[:36]  # words and translation to the bit; angles went through sine and cosine
+        assert again[:36] == content[:36]  # words and translation are exact; angles passed through sine and cosine
         np.testing.assert_allclose(struct.unpack(">3d", again[36:]), angles_deg, atol=1e-9)
         assert struct.pack(DOF_FORMAT, *struct.unpack(DOF_FORMAT, again)) == again
 
 
 def test_a_dof_of_known_bytes() -> None:
-    """A quarter turn about z by IRTK's angle, which is minus the usual one, and a translation, byte by byte."""
+    """Bytes of a 90 degree rotation about z (IRTK's angle has the opposite sign) and a translation."""
     pose = RigidPose(Rotation.from_euler("z", -90, degrees=True).as_matrix()[None], np.array([[1.0, -2.0, 0.5]]))
     expected = "000c6f9f00000002000000063ff0000000000000c0000000000000003fe0000000000000"
     content = dof_bytes(pose)

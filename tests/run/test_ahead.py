@@ -1,4 +1,4 @@
-"""Values made ahead: once, wherever they are asked for, with their errors."""
+"""Values computed ahead: once, for all callers, with their errors passed on."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_an_error_comes_out_where_the_value_is_asked_for() -> None:
 
 
 def test_modules_are_imported_beside_the_caller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What asks for one waits until it is there; one that cannot be imported stops nobody but who uses it."""
+    """Users of a module wait until it is imported; a failed import affects only users of that module."""
     text = "import threading, time\ntime.sleep(0.1)\nby = threading.current_thread().name\n"
     (tmp_path / "slow_module.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)

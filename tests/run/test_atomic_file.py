@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that are written atomically."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from g3r.run.process_mark import process_mark
 
 
 def test_two_writers_of_one_number_do_not_meet(tmp_path: Path) -> None:
-    """As in two containers, each of which is process 1: the file is that of the last, and whole."""
+    """As in two containers, both with process 1: the file is that of the last writer, and complete."""
     path = tmp_path / "table.tsv"
     with atomic_path(path) as first:
         first.write_text("first")
@@ -53,7 +53,7 @@ def test_the_umask_holds(tmp_path: Path) -> None:
 
 def test_leftovers_of_this_place_alone_are_removed(tmp_path: Path) -> None:
     place, own = process_mark().split("-")
-    nobodys = 4194399  # above the most that Linux numbers
+    nobodys = 4194399  # above the largest process id of Linux
     names = [f".{place}-{own}-a.x.ckpt", f".00000000-{nobodys}-a.x.ckpt", f".{place}-{nobodys}-a.x.txt", ".x.ckpt"]
     for name in (*names, f".{place}-{nobodys}-a.x.ckpt"):
         (tmp_path / name).write_text("")

@@ -1,4 +1,4 @@
-"""A run's stages: timed, kept, dropped or stopped, with one exit."""
+"""Stages of a run context: timing, storage, dropping and stopping."""
 
 from __future__ import annotations
 

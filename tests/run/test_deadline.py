@@ -1,4 +1,4 @@
-"""Loops that end by number or by the clock."""
+"""Loops that end by their number of steps or by the clock."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Idle threads of a program sleep, unless the environment says otherwise."""
+"""Idle threads of a program sleep, unless the environment sets another policy."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ print(busy_s / idle_s)
 
 
 def busy_share(**environment: str) -> float:
-    """Of a core, what two threads take while they have nothing to do: neither the machine's speed nor its cores count.
+    """Share of a core that two idle threads use, independent of the machine's speed and number of cores.
 
-    A machine that is busy with something else gives them less, never more.
+    Other load on the machine can only lower it.
     """
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
     run = subprocess.run(

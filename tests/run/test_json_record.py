@@ -1,4 +1,4 @@
-"""Records as JSON and back: the same record, or an error that names the field."""
+"""Records as JSON and back: an equal record, or an error that names the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels are kept on disk wherever that is possible, and run where home and package are read-only."""
+"""The cache of compiled kernels: kept on disk if possible; kernels run even if home and package are read-only."""
 
 import os
 import shutil
@@ -31,9 +31,9 @@ print(g3r.__file__, derive_shapes.stats.cache_hits)
 
 @pytest.fixture
 def blocked(tmp_path: Path) -> dict[str, str]:
-    """A copy of the package and a home in which nothing can be made, whoever tries.
+    """A copy of the package and a home folder in which no user can create anything.
 
-    Permissions do not hold back root; a file in a folder's place does.
+    Permissions do not stop root, but a file in place of a folder does.
     """
     source = tmp_path / "installed" / "g3r"
     shutil.copytree(PACKAGE, source, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
@@ -81,7 +81,7 @@ def test_kernels_are_kept_and_found_in_the_cache_folder_of_the_user(blocked: dic
 
 @pytest.mark.skipif(sys.platform == "win32", reason="homes are elsewhere")
 def test_a_folder_of_somebody_else_is_not_used(blocked: dict[str, str], tmp_path: Path) -> None:
-    """What lies in the cache is run as code, and anybody may make folders among the temporary files."""
+    """Cache content is run as code, and any user may create folders among the temporary files."""
     planted = tmp_path / "tmp" / f"g3r-kernels-{os.getuid()}"
     planted.mkdir()
     planted.chmod(0o777)
@@ -106,7 +106,7 @@ def test_may_write(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["chosen", "package", "user"])
 def test_compiled_kernels_are_found(place: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """In the folder that was chosen, in the package, or, where that is read-only, in the user's cache folder."""
+    """They are found in the chosen folder, in the package, or, if that is read-only, in the user's cache folder."""
     package, home = tmp_path / "g3r", tmp_path / "home"
     for room in ("acquisition", "gaussians"):
         (package / room).mkdir(parents=True)
@@ -126,7 +126,7 @@ def test_compiled_kernels_are_found(place: str, monkeypatch: pytest.MonkeyPatch,
 
 
 def keep(room: Path) -> Path:
-    """An empty file where numba would keep a kernel of a room."""
+    """Create an empty file where numba would cache a kernel of a room."""
     path = kept_in(room) / "kernels.forward-217.py311.nbi"
     path.parent.mkdir(parents=True)
     path.touch()

@@ -1,4 +1,4 @@
-"""log.txt: paths lose their folders, other libraries stay out, and a file that cannot be written is no fault."""
+"""log.txt: paths without folders, no messages of other libraries, and no failure if it cannot be written."""
 
 from __future__ import annotations
 

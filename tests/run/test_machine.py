@@ -1,4 +1,4 @@
-"""Threads: never more than the process was started with."""
+"""Number of threads: never more than at the start of the process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""torch on demand is torch, with the threads that were asked for before it was imported."""
+"""torch on demand behaves like torch, with the number of threads requested before its import."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from g3r.run.on_demand import is_tensor, torch
 
 
 def after(code: str) -> str:
-    """What a fresh interpreter prints."""
+    """Output of a fresh interpreter."""
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return run.stdout.strip()
 

@@ -1,4 +1,4 @@
-"""Names that tell whether the process behind a file still runs."""
+"""Process marks in file names, which show whether the writing process still runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from g3r.run.process_mark import is_left_over, process_mark
 
 @pytest.fixture
 def ended() -> str:
-    """The number of a process that has ended."""
+    """The id of an ended process."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return str(process.pid)
@@ -37,7 +37,7 @@ def test_other_names_are_nobodys(ended: str) -> None:
 def test_processes_of_other_places_cannot_be_judged(
     differs: str, ended: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another host, and another container of the same host name: the number is free here and may be taken there."""
+    """Another host, or another container with the same host name: an id that is free here may be in use there."""
     here = process_mark().split("-")[0]
     if differs == "host":
         monkeypatch.setattr("g3r.run.process_mark.socket.gethostname", lambda: "another")

@@ -1,4 +1,4 @@
-"""Signals during a run, and loops that they cut."""
+"""Stop requests by signals, and the loops that they cut."""
 
 from __future__ import annotations
 
@@ -84,4 +84,4 @@ def test_what_the_clock_decided_is_repeated_without_it() -> None:
     assert len(steps) < 100
     again = Deadline(loop_record=LoopRecord(loop_record.loops, repeating=True))
     assert [list(timed_steps(100, again.part(0.5))), list(timed_steps(4, again)), again.has_passed()] == first
-    assert list(timed_steps(5, again)) == []  # more loops than there were
+    assert list(timed_steps(5, again)) == []  # more loops than were recorded

@@ -1,4 +1,4 @@
-"""What a cohort costs: the page of many, and the table of the study."""
+"""Cost of a cohort: the page of many sessions, and the table of the study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The harness: what is kept of an earlier record, where tables go, how a command ends; every study starts."""
+"""The harness: resumed records, published tables, exit codes; every study starts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PAGE = "before\n<!-- squares:begin -->\nold\n<!-- squares:end -->\nafter\n"
 
 
 def square(n: int, folder: Path) -> dict[str, int] | None:
-    """Measured once: a second time there is a file."""
+    """A measurement that works only once, because the second time its file exists."""
     (folder / f"measured-{n}").touch(exist_ok=False)
     if n == 13:
         raise InputError("13 is refused")
@@ -56,7 +56,7 @@ def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path: Path, capsy
     assert study.main(["3", "13", *output]) == InputError.exit_code
     assert "page.squares: 13 is refused" in capsys.readouterr().err
     assert list(json.loads((tmp_path / "out" / "squares.json").read_text())["rows"]) == ["3"]
-    # 3 is not measured again, 4 has no row, rows stand in the order of the tasks
+    # 3 is not measured again, 4 has no row, rows are in the order of the tasks
     assert study.main(["2", "3", "4", *output, "--docs", str(tmp_path / "page.md")]) == 0
     assert "1 rows kept" in capsys.readouterr().out
     lines = "| n | squared |\n| --- | ---: |\n| 2 | 4 |\n| 3 | 9 |"
@@ -66,7 +66,7 @@ def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path: Path, capsy
     assert stated("Not measured yet.", machine) == "Not measured yet."
     assert stated("| a |", {"machine": machine, "weights": "ab"}).endswith(". Prior of weights ab.")
     assert (tmp_path / "out" / "squares.md").read_text() == lines + "\n"
-    assert study.main(["9", *output]) == 1  # the verdict
+    assert study.main(["9", *output]) == 1  # the study's verdict is False
 
 
 def test_rows_of_other_settings_are_neither_mixed_nor_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,7 +75,7 @@ def test_rows_of_other_settings_are_neither_mixed_nor_lost(tmp_path: Path, capsy
     before = (tmp_path / "out" / "squares.json").read_bytes()
     assert study.main(["5", *output, "--unit", "m"]) == InputError.exit_code
     assert "measured with unit mm instead of m" in capsys.readouterr().err
-    assert study.main(["2", *output, "--unit", "m", "--fresh"]) == InputError.exit_code  # 3 would be lost
+    assert study.main(["2", *output, "--unit", "m", "--fresh"]) == InputError.exit_code  # row 3 would be lost
     assert (tmp_path / "out" / "squares.json").read_bytes() == before
     for path in tmp_path.glob("measured-*"):
         path.unlink()
@@ -90,7 +90,7 @@ def test_rows_that_are_renewed_or_were_skipped_are_not_kept(tmp_path: Path) -> N
     assert resumed(path, new, {"a"})["rows"] == {"b": {"x": 2, "commit": "a"}}
     own = {"d": {"x": 3, "commit": "b"}, "e": {"x": 4, "commit": None}}
     path.write_text(json.dumps(new | {"rows": {"b": {"x": 2}, **own}}))
-    assert resumed(path, new, set())["machine"]["commit"] == "a, b, unknown"  # tables say of which commits they are
+    assert resumed(path, new, set())["machine"]["commit"] == "a, b, unknown"  # tables name their commits
     path.write_text("[]")
     with pytest.raises(InputError, match="not a record"):
         resumed(path, new, set())

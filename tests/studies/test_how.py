@@ -1,4 +1,4 @@
-"""The moving picture: its frames, and the one that is in the docs."""
+"""The moving picture of docs/how.md: its frames, and the published file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from studies.harness import DOCS
 from studies.how import fit
 
 MAX_BYTES = 600_000
-"""A page with pictures should open at once."""
+"""Largest size of the picture, so that the page opens quickly."""
 
 
 def test_the_picture_in_the_docs_moves_and_is_small() -> None:
@@ -21,7 +21,7 @@ def test_the_picture_in_the_docs_moves_and_is_small() -> None:
         image.seek(image.n_frames - 1)  # type: ignore[attr-defined]
         last = np.asarray(image.convert("L"), dtype=float)
     middle = first.shape[1] // 2
-    assert np.abs(first - last)[: fit.HEIGHT, : middle - 40].mean() < 3  # the stack stands still, but for the coding
+    assert np.abs(first - last)[: fit.HEIGHT, : middle - 40].mean() < 3  # the stack does not change, except by coding
     assert np.abs(first - last)[: fit.HEIGHT, middle:].mean() > 6
 
 

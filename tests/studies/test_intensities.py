@@ -1,4 +1,4 @@
-"""The study of gains and fields against the truth: what it calls an error, and its table."""
+"""The study of gains and fields against the truth: its error measure and its table."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The lesion measure: 1 for the truth, 0 for no lesion; lesions are where and what they should be."""
+"""The lesion study: the measure is 1 for the truth and 0 for no lesion; lesions have the right place and size."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHAPE = (52, 60, 50)
 
 @pytest.fixture(scope="module")
 def head() -> tuple[TruthVolume, np.ndarray]:
-    """A grey ball with a core of brighter tissue and two ventricles, voxels of 1.2 mm."""
+    """A grey ball with a brighter core and two ventricles, in voxels of 1.2 mm."""
     index = np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2 for n in SHAPE], indexing="ij"), -1) * 1.2
     radius = np.linalg.norm(index, axis=-1)
     mask = radius < 29
@@ -53,7 +53,7 @@ def test_truth_keeps_everything_and_a_blank_nothing(lesions: list[Lesion]) -> No
         assert kept(lesion.change, lesion) == pytest.approx(1)
         assert kept(np.zeros(SHAPE), lesion) == 0
         assert kept(0.3 * lesion.change, lesion) == pytest.approx(0.3)
-        assert kept(lesion.change + 100.0, lesion) == pytest.approx(1)  # a brighter image is no lesion
+        assert kept(lesion.change + 100.0, lesion) == pytest.approx(1)  # a constant offset does not count
 
 
 def test_a_lesion_elsewhere_is_not_kept(lesions: list[Lesion]) -> None:
@@ -68,7 +68,7 @@ def test_spheres_have_their_size_and_level(head: tuple[TruthVolume, np.ndarray],
         lesion = next(one for one in lesions if one.kind == kind)
         index = np.round(np.linalg.inv(truth.affine) @ [*lesion.center_mm, 1])[:3].astype(int)
         assert changed.data[tuple(index)] == pytest.approx(1000 * level, rel=1e-5)
-        # the share of the way to the level, voxel by voxel, adds up to the volume
+        # the change relative to the contrast, summed over voxels, is the volume
         way = 1000 * level - truth.data
         share = np.divide(lesion.change, way, out=np.zeros_like(way), where=way != 0)
         assert share.sum() * 1.2**3 == pytest.approx(np.pi / 6 * DIAMETER_MM**3, rel=0.1)

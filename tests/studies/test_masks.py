@@ -1,4 +1,4 @@
-"""The studies of the mask networks: what their tables say, and what they need."""
+"""The studies of the mask network: their tables, and what they require."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def found_mask(mask: np.ndarray, spacing_mm: np.ndarray) -> inference.BrainMask:
 
 @pytest.fixture
 def row(monkeypatch: pytest.MonkeyPatch) -> Row:
-    """A mask that is moved by one pixel and lacks the last slice."""
+    """Row of a mask that is shifted by one pixel and lacks the last slice."""
     true = np.zeros((30, 30, 4), dtype=bool)
     true[5:15, 5:15, 1:4] = True
     found = np.roll(true, 1, axis=0)
@@ -53,7 +53,7 @@ def test_scores_of_a_stack(row: Row) -> None:
     assert "1 slices lost" in overlap.line("stack", row)
 
 
-def test_tables(row: Row) -> None:
+def test_tables_count_found_missed_and_falsely_found_heads(row: Row) -> None:
     without = {"head": False, "found": True, "presence": 0.7, "volume_ml": 11.0, "seconds": 1.0, "reason": ""}
     missed = {**row, "found": False, "centre_mm": None, "dice": 0.0, "lost_slices": 3}
     text = simulated.tables({"rows": {"a": row, "b": missed, "c": without}})["masks-simulated"]

@@ -1,4 +1,4 @@
-"""Studies of motion: their subjects, counts and tables, and jerks in the order of time."""
+"""Motion studies: subjects, counts, tables, and jerks in the order of time."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_sweep_counts_who_was_warned() -> None:
         "a": subject("severe", 0.4, 1.0, warned=False),
         "b": subject("severe", 0.6, 2.0, warned=True, off=0.2),
         "c": subject("severe", 8.0, 20.0, warned=True, off=None),  # refused
-        "d": subject("severe", 1.0, 3.0, warned=False, off=0.06),  # not under a millimetre
+        "d": subject("severe", 1.0, 3.0, warned=False, off=0.06),  # median not under 1 mm
         "e": subject("mild", 0.3, 0.5, warned=False),
         "f": subject("mild", 5.0, 7.0, warned=True, off=None, turned=True),
     }
@@ -97,7 +97,7 @@ def test_variants_are_settings_that_exist(variants: dict[str, dict[str, Any]]) -
 
 
 def test_jerks_are_found_in_the_order_of_time() -> None:
-    """Ten slices, taken 0 2 4 6 8 1 3 5 7 9; the head jumps 5 mm before slice 8."""
+    """Ten slices in the order 0 2 4 6 8 1 3 5 7 9; the head jumps by 5 mm before slice 8."""
     place = places_in_time(10)
     assert place.tolist() == [0, 5, 1, 6, 2, 7, 3, 8, 4, 9]
     shift = np.zeros((10, 3))

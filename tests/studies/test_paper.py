@@ -1,4 +1,4 @@
-"""Tables of the paper's protocol: subjects, baselines, other programs by a small fake one, what a record shows."""
+"""Study of the paper's protocol: subjects, baselines, a fake other program, tables and pictures of a record."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ shutil.copy(Path(stacks[0]).with_name("truth.nii.gz"), output)
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> SimulatedCase:
-    """A small head, two stacks, hardly any noise."""
+    """A small head with two stacks and almost no noise."""
     folder = tmp_path_factory.mktemp("paper") / "case"
     truth = load_volume_of(PhantomSubject("phantom", 21.0, 1), 2.0)
     truth = replace(truth, data=truth.data * np.float32(1000))
@@ -84,7 +84,7 @@ def test_least_squares_are_better_than_the_scattered_volume(case: SimulatedCase,
     for regulariser in (TIKHONOV, TOTAL_VARIATION):
         found = least_squares_volume(volumes, ones, ones, regulariser)
         assert psnr_db(found, volumes, case) > coarse + 1, regulariser
-    # without data beyond the mask the strongest regulariser leaves a flat volume there, and no NaN anywhere
+    # without data, the strongest regulariser gives a flat volume beyond the mask, and no NaN
     flat = least_squares_volume(volumes, ones, ones, replace(TOTAL_VARIATION, strength=100.0))
     assert np.isfinite(flat).all()
     assert flat.std() < volumes.coarse.std()
@@ -108,7 +108,7 @@ def test_the_printed_amplitude_is_another(volumes: InitialVolumes) -> None:
         fit_unconstrained(volumes, ones, ones, 4.0, Unconstrained(attenuation=a, n_steps=5), np.random.default_rng(0))
         for a in ("exact", "printed")
     )
-    # without the factor B each Gaussian is brighter in a slice, so that it has to be darker itself
+    # without the factor B each Gaussian is brighter in a slice, so its amplitude must be lower
     assert float(printed.amplitude.mean()) < float(exact.amplitude.mean())
 
 
@@ -133,7 +133,7 @@ def test_another_program_is_run_and_scored(
     monkeypatch.setattr(peers, "paper_case", lambda spec, atlas, cache, n: case)
     spec = phantom_heads(16, "moderate")[0]
     row = peers.measure_peer(spec, 2, fake_peer(tmp_path), options())
-    assert row["scores"]["fake"]["mask"]["psnr_db"] > 60  # the truth itself, aligned with itself
+    assert row["scores"]["fake"]["mask"]["psnr_db"] > 60  # the truth aligned with itself
     assert row["scores"]["fake"]["grid"]["ssim"] > 0.99
     for wrong in ("false {stacks} {output}", "no-such-program {stacks} {output}", "true {stacks} {output}"):
         refused = peers.measure_peer(spec, 2, peers.peer(f"wrong={wrong}"), options())
@@ -155,7 +155,7 @@ def test_places_inside_words(tmp_path: Path) -> None:
 
 
 def test_beside_the_brain_black_stays_black(case: SimulatedCase) -> None:
-    """The fit in the mask has an offset; on the whole grid it must not light up the background."""
+    """The fit in the mask has an offset, which must not brighten the background on the whole grid."""
     dimmed = np.where(case.truth_mask, 0.5 * case.truth.data + 100, 0).astype(np.float32)
     row, _ = scored(case, dimmed, case.truth.grid, RigidPose.identity(1), None)
     assert row["mask"]["psnr_db"] > 50

@@ -1,4 +1,4 @@
-"""Real stacks by the paper's protocol: one is left out and predicted; a small phantom stands for them."""
+"""Study of real stacks, with a small phantom in their place: each stack is left out and predicted."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def record(subject: Path, output: Path) -> Record:
-    """The repeat, predicted from both stacks."""
+    """Record of the repeat, predicted from both stacks."""
     given = options(subject, "--output", str(output))
     (task,) = [task for task in tasks(given) if task.key == "subject 1 of all stacks"]
     machine = {"processor": "a", "cores": 1, "threads": 1, "python": "3", "torch": "2", "numba": "0"}

@@ -1,4 +1,4 @@
-"""Studies of the prior: statistics and marks of their tables, subjects and networks; nothing is trained here."""
+"""Prior studies, without any training: statistics and marks of their tables, subjects and networks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SETTINGS = {"preset": "balanced", "weights": "abc", "threads": 2, "n_views": 4}
 
 
 def ablation_rows(gain: tuple[float, float, float] = (2.0, 1.0, 0.5)) -> dict[str, dict[str, Any]]:
-    """Two subjects, from 1 and 3 stacks."""
+    """Rows of two subjects, from 1 and 3 stacks."""
     rows = {}
     for number, (name, volume) in enumerate({"a": "crl-sta/sta24", "b": "spina-bifida/sb25-operated"}.items()):
         for n in (3, 1):
@@ -79,7 +79,7 @@ def test_alone_table_marks_what_falls_short() -> None:
     text = alone.tables(SETTINGS | {"rows": rows})["alone"]
     assert "| 22.90 / 0.810 | +2.90 (!) | 0.810 | 2.5 |" in text
     assert "| +2.10 | 0.840 (!) | 2.5 |" in text
-    assert "| +0.50 | 0.500 | 2.5 |" in text  # nothing was asked of two stacks
+    assert "| +0.50 | 0.500 | 2.5 |" in text  # there is no requirement for two stacks
     assert "the network 5.5 s (asked: under 5 (!)), and the mean over the 4 views of the product 4.9 s." in text
     assert "2.0e-04 of the intensity scale (asked: 0.001)" in text
 
@@ -258,7 +258,7 @@ def test_volumes_of_a_case_start_from_a_template_at_the_truth(subject: Path) -> 
         assert {one.shape for one in made.by_name.values()} == {made.grid.shape}
         dense = made.maps.density > 2
         assert dense.any()
-        # not trained: the base of Eq. 7
+        # an untrained network gives the base of Eq. 7
         np.testing.assert_allclose(made.by_name["V_prior"][dense], made.by_name["V_coarse"][dense], atol=2e-3)
         assert made.maps.outline is not None
         inside = score_dice(made.maps.outline > 0.5, resample_mask(case, made.grid))

@@ -1,4 +1,4 @@
-"""docs/results.md: it is what the other pages say now, and claims follow from figures."""
+"""docs/results.md agrees with the other pages, and claims follow from figures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEAD = "| method | subjects | s | PSNR, dB | SSIM | LPIPS |\n| --- | ---: | ---:
 
 
 def methods(g3r: str, others: str, stacks: str = "3 stacks") -> Block:
-    """Table 1 with these rows, in the mask and on the grid."""
+    """Table 1 with the given rows, in the mask and on the grid."""
     said = "g3r: +3.00 dB over the best volume without a network (least squares, TV; least +2.00)."
     text = f"**Moderate motion, {stacks}, 16 subjects.** {said}\n\nIn the mask:\n\n{HEAD}{g3r}\n{others}\n"
     text += f"\n<details><summary>On the whole grid</summary>\n\n{HEAD}{g3r}\n{others}\n\n</details>"
@@ -53,7 +53,7 @@ def test_every_claim_is_of_a_published_block(blocks: Mapping[str, Block]) -> Non
 
 
 def test_what_is_measured_is_judged(blocks: Mapping[str, Block]) -> None:
-    """Where a table is there and no claim finds its figure, they look for it under a wrong name."""
+    """If a published table has no figure for its claims, they look for a wrong name."""
     found = [one for several in judgements(blocks).values() for one in several]
     for name in {one.claim.block for one in found}:
         of_block = [one for one in found if one.claim.block == name]
@@ -74,14 +74,14 @@ def test_tables_say_where_they_are_from(blocks: Mapping[str, Block]) -> None:
     assert re.fullmatch(r"[0-9a-f]{7,}\+?", blocks["paper-real"].commit)
     assert blocks["paper-real"].machine.endswith(" threads")
     unsaid = [name for name, block in blocks.items() if block.is_measured and not origin(name, blocks).commit]
-    # tests hold the tables of numerics; the row of another program was measured once, by hand
+    # the tables of numerics are checked by tests; the row of another program was measured once, by hand
     assert all(name.startswith("numerics-") or name == "peers" for name in unsaid), unsaid
     assert replace(blocks["ablation"], text="weights 0123456789abcdef").is_older("f" * 16)
     assert not blocks["numerics-shape"].is_older("f" * 16)
 
 
 def test_claims_follow_the_figures() -> None:
-    """The whole study, as it may end: enough subjects, and all better than now, or worse."""
+    """A complete study with enough subjects, and all results better or worse than now."""
     good = methods(
         "| g3r | 16 | 30 ± 5 | 31.00 ± 1.00 | 0.970 ± 0.010 | 0.010 ± 0.001 |",
         "| V_prior | 16 | 30 | 32.00 | 0.980 | 0.001 |\n| least squares, TV | 16 | 2 | 28.00 | 0.950 | 0.020 |\n"
@@ -91,7 +91,7 @@ def test_claims_follow_the_figures() -> None:
     for words in ("PSNR in the mask", "SSIM in the mask", "Better LPIPS", "whole grid", "Seconds"):
         assert outcome(claims, words, good).outcome == HOLDS, words
     best = outcome(claims, "Better PSNR than every baseline, in the mask", good)
-    # V_prior is part of g3r, and another program with fewer subjects is not compared
+    # V_prior is part of g3r, and a program with fewer subjects is not compared
     assert best.finding is not None
     assert best.finding.figure == "+3.00 dB over least squares, TV; without nesvor"
     assert "+3.00 dB" in best.conclusion

@@ -1,4 +1,4 @@
-"""The study of what goes wrong: each damage does what it says, and its table counts right."""
+"""The stress studies: the effect of each damage, and the counts of the tables."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_the_table_of_draws_counts_stacks_that_were_spoilt() -> None:
     assert "1 name what is wrong with the stacks, 1 are false alarms" in text
     assert "Of 4 stacks that do not belong 1 were left out; of 3 sets without one 1 lost a stack." in text
     assert "Where it stayed the verdict was *use* in 1 of 3." in text
-    # a sound stack that was left out does not hide the spoilt one that stayed
+    # leaving out a good stack does not hide that the bad one stayed
     worst = good | use | {"spoilt": "b", "left_out": ["a"]}
     more = {str(n): row for n, row in enumerate([*rows, worst])}
     assert "Where it stayed the verdict was *use* in 2 of 4." in drawn.tables(record | {"rows": more})["stress-drawn"]

@@ -1,4 +1,4 @@
-"""Subjects of the studies: repeatable, cached, their true poses read back from files, volumes aligned."""
+"""Subjects of the studies: reproducibility, cache, true poses from files, alignment of volumes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SPEC = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
 
 @pytest.fixture
 def atlas(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """A tree with one small head."""
+    """An atlas folder with one small head."""
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
     mask = np.linalg.norm(index / [10, 11, 9], axis=-1) < 1
     data = np.where(mask, 500 + 100 * rng.random(mask.shape), 0).astype(np.float32)
@@ -41,7 +41,7 @@ def atlas(tmp_path: Path, rng: np.random.Generator) -> Path:
 def test_a_subject_that_another_process_made_meanwhile_is_taken(
     atlas: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As two jobs of a study do that want the same one at its start."""
+    """Two jobs of a study need the same subject at the same time."""
     cache = tmp_path / "cache"
     simulate = subjects.simulate_stacks
 
@@ -67,12 +67,12 @@ def test_subject_is_simulated_once_and_read_back(atlas: Path, tmp_path: Path) ->
         simulated_subject(replace(SPEC, bias=0.15), atlas, tmp_path / "cache")
     case = load_case(folder)
     assert [stack.thickness_mm for stack in case.stacks] == [2.2] * 3
-    spacing = case.truth.grid.spacing_mm  # stretched by up to a twentieth, each axis by its own factor
+    spacing = case.truth.grid.spacing_mm  # each axis is stretched by its own factor of up to 5 %
     assert np.abs(spacing / 2 - 1).max() < 0.05
     assert len(set(np.round(spacing, 6))) == 3
     assert 1 < case.header_error().mean_mm < 40
 
-    # both tables of true poses say the same
+    # both tables of true poses agree
     table = case.true
     (folder / "poses.tsv").unlink()
     other = read_true_poses(folder)
@@ -86,13 +86,13 @@ def test_turned_subject_keeps_its_size(atlas: Path, tmp_path: Path) -> None:
     axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
     assert np.abs(axes).max() < 0.999
-    # a result in scanner space lies as askew as the head; one turned with it stands upright
+    # a result in scanner space is as oblique as the head; one that is rotated with it is upright
     assert orientation_deg(case, RigidPose.identity(1)) > 2
     assert orientation_deg(case, RigidPose(axes[None], np.ones((1, 3)))) == pytest.approx(0, abs=1e-3)
 
 
 def test_error_of_a_hand_made_case(tmp_path: Path) -> None:
-    """Two stacks, one left-handed; one slice in ten is 3 mm off by its header, and one 90 degrees turned."""
+    """Two stacks, one left-handed; one slice in ten is 3 mm off by its header, and one is rotated by 90 degrees."""
     rows = []
     for stack, flip in enumerate([1.0, -1.0]):
         affine = np.diag([flip * 1.0, 1.0, 3.0, 1.0])
@@ -111,7 +111,7 @@ def test_error_of_a_hand_made_case(tmp_path: Path) -> None:
     case = load_case(tmp_path, thickness_mm=2.5)
     assert case.stacks[1].thickness_mm == 2.5
     error = case.header_error()
-    assert error.median_mm < 0.1  # the turned slice still pulls a little at the common motion
+    assert error.median_mm < 0.1  # the rotated slice still affects the common motion slightly
     assert error.per_slice_mm[0, 4] == pytest.approx(3.0, abs=0.1)
     points = case.points_mm[1, 7][:, :2]
     assert error.per_slice_mm[1, 7] == pytest.approx(np.linalg.norm(points, axis=1).mean() * 2**0.5, rel=0.02)
@@ -149,7 +149,7 @@ def test_data_folder_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_volume_far_away_is_brought_near_by_the_motion_of_its_slices(rng: np.random.Generator) -> None:
-    """Half a turn and a metre away, with other intensities; what is left, a millimetre, alignment finds."""
+    """180 degrees and a metre away, with other intensities; alignment then finds the remaining millimetre."""
     shape = (40, 44, 36)
     truth = gaussian_filter(rng.normal(size=shape), 2.5)
     truth = (1 + truth / truth.std()).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Studies of the trade-off: steps read off a curve, marks in tables, a small phantom."""
+"""Trade-off studies: steps read from a curve, marks in tables, a small phantom."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The judgement of the uncertainty: calibrated, ordered and constant statements are told apart."""
+"""The judgement of uncertainty distinguishes calibrated, ranked and constant statements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from studies.uncertainty.judgement import EXPONENTIAL_COVERAGE, check_record, ch
 
 @pytest.fixture
 def sample() -> tuple[np.ndarray, np.ndarray]:
-    """Stated values over a factor of 20, and errors of exponential size about them."""
+    """Stated values over a range of a factor of 20, and exponentially distributed errors with these means."""
     rng = np.random.default_rng(0)
     stated = np.exp(rng.uniform(np.log(0.01), np.log(0.2), 40_000))
     return stated, rng.exponential(stated)
@@ -65,7 +65,7 @@ def test_fit_and_check_share_no_volume_and_no_seed() -> None:
     for what in ("volume", "seed"):
         assert not {getattr(spec, what) for spec in fitted} & {getattr(spec, what) for spec in checked}
     assert len({spec.name for spec in fitted}) == len(fitted)
-    for subjects in (FIT_SUBJECTS, CHECK_SUBJECTS):  # whole ones and ones with a hole, from one stack and from three
+    for subjects in (FIT_SUBJECTS, CHECK_SUBJECTS):  # with and without holes, from one stack and from three
         assert {(one.n_stacks, bool(one.holes)) for one in subjects} == {(1, True), (1, False), (3, True), (3, False)}
     never_trained_on = ("-operated", "sta24", "sta30", "sta34")
     assert all(spec.volume.endswith(never_trained_on) for spec in (*fitted, *checked))
@@ -100,12 +100,12 @@ def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:
 def test_record_table_and_figure(tmp_path: Path) -> None:
     found = [judged_subject("a", 3, 0), judged_subject("b", 3, 1), judged_subject("c", 1, 2)]
     found.append(judged_subject("not registered", 3, 3))
-    found[-1].registered = False  # has a row, and no part in the figures of all
+    found[-1].registered = False  # has a row, but is not part of the figures of all subjects
     found[-1].error = 10 * found[-1].error
     record = check_record(found, ErrorModel(-0.1, {"log residual": 1.0}))  # type: ignore[arg-type]
     assert set(record["by_stacks"]) == {"1", "3"}
     assert record["by_stacks"]["3"]["mean_error"] < 0.1
-    assert record["by_stacks"]["3"]["unseen"] is None  # nothing was unseen
+    assert record["by_stacks"]["3"]["unseen"] is None  # there was no unseen part
     unseen = record["by_stacks"]["1"]["unseen"]
     assert unseen["mean_error"] == pytest.approx(np.abs(found[2].error[found[2].unseen]).mean())
     text = check_text({"with prior": {"preset": "p", "weights": "w", **record}})

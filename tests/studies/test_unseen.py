@@ -1,4 +1,4 @@
-"""Holes of the studies: which slices they empty, and what the tables say of them."""
+"""Holes of the studies: the slices that they remove, and the tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Short trainings, what they write to TensorBoard, and what `g3r-export` makes of their checkpoints."""
+"""Short trainings, their TensorBoard logs, and exports of their checkpoints by `g3r-export`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def trainer(folder: Path, **options: Any) -> lightning.Trainer:
 
 
 class Losses(lightning.Callback):
-    """Keeps the loss of every step, and ends the run at one of them as a kill would."""
+    """Callback that keeps the loss of every step, and can abort the run at a step like a kill."""
 
     def __init__(self, end_at: int | None = None) -> None:
         self.found: dict[int, float] = {}
@@ -50,7 +50,7 @@ def assert_resuming_changes_nothing(
     folder: Path,
     n_epochs: int = 3,
 ) -> None:
-    """What goes on from the first epoch's checkpoint has the losses, step by step, and the weights of the whole run."""
+    """Assert that resuming from the first epoch's checkpoint gives the losses and weights of the uninterrupted run."""
 
     def run(seed: int, resume: Path | None = None) -> tuple[dict[int, float], AnnealedModule]:
         torch.manual_seed(seed)
@@ -72,12 +72,12 @@ def assert_resuming_changes_nothing(
 
 
 def in_memory(samples: list[dict[str, torch.Tensor]], batch_size: int | None = None) -> DataLoader:
-    """A loader of samples that are there already."""
+    """A loader of given samples."""
     return DataLoader(cast(Dataset, samples), batch_size=batch_size)
 
 
 def logged(folder: Path) -> Any:
-    """What TensorBoard finds in the folder of one version of a run."""
+    """TensorBoard's data of one version of a run."""
     accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     found = accumulators.EventAccumulator(str(folder))
     found.Reload()
@@ -91,7 +91,7 @@ def assert_export_refuses(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """An altered training checkpoint is refused in one line, and nothing is written."""
+    """Assert that an altered training checkpoint is refused in one line, and nothing is written."""
     content = torch.load(checkpoint, weights_only=True)
     alter(content)
     torch.save(content, folder / "run.ckpt")

@@ -1,4 +1,4 @@
-"""Volumes of the prior's training, made in memory."""
+"""Training volumes of the prior network, made in memory."""
 
 from __future__ import annotations
 
@@ -33,6 +33,6 @@ def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
 
 
 def given_at_random(*shape: int) -> PriorInputs:
-    """Inputs of a network that mean nothing."""
+    """Random inputs of a network."""
     names = ("coarse", "density", "share", "sharp", "template", "outline")
     return PriorInputs(**{name: torch.rand(1, 1, *shape) for name in names})

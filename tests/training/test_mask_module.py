@@ -1,4 +1,4 @@
-"""Training of the mask network, its logs, and the way to a file."""
+"""Training of the mask network, its logs, and export."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_loss_falls(trained: tuple[Path, Path, MaskModule]) -> None:
     assert board.Tags()["images"]
 
 
-@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes to the same folder
 def test_resuming_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
     assert_resuming_changes_nothing(lambda: MaskModule(network=NETWORK, warmup_steps=1), TinyData, tmp_path)
 
@@ -97,7 +97,7 @@ def test_export_and_load(trained: tuple[Path, Path, MaskModule], tmp_path: Path)
         Prior.load(file)
 
 
-def test_start_from(trained: tuple[Path, Path, MaskModule], tmp_path: Path) -> None:
+def test_start_from_takes_all_weights_of_a_checkpoint(trained: tuple[Path, Path, MaskModule], tmp_path: Path) -> None:
     again = MaskModule(network=NETWORK, start_from=str(trained[1]))
     for name, value in trained[2].network.state_dict().items():
         assert torch.equal(again.network.state_dict()[name].cpu(), value.cpu()), name
@@ -110,7 +110,7 @@ def test_data_of_another_resolution_is_refused(tmp_path: Path) -> None:
         trainer(tmp_path, max_epochs=1).fit(MaskModule(network=NETWORK), datamodule=TinyData(pixel_mm=2.0))
 
 
-def test_scores() -> None:
+def test_scores_are_dice_with_a_head_and_false_area_without() -> None:
     batch = sample(1)
     config = MaskNetworkConfig(wide_mm=4.0, pixel_mm=4.0)
     assert scores_of(batch["wide_mask"], batch["mask"], batch, config) == {"find_dice": 1.0, "outline_dice": 1.0}
@@ -127,9 +127,9 @@ def test_impossible_settings_are_refused() -> None:
         MaskModule(network=NETWORK, wide_weight=0.0)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # jsonargparse's, of its own
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # raised inside jsonargparse
 def test_the_command_reads_the_config(pytestconfig: pytest.Config, capsys: pytest.CaptureFixture[str]) -> None:
-    """Settings are read and shown, and the data module takes them."""
+    """The settings are read and printed, and the data module accepts them."""
     path = pytestconfig.rootpath / "lightning_configs" / "mask.yaml"
     with pytest.raises(SystemExit) as done:
         pretrain.main(["fit", "--config", str(path), "--model.network.wide_mm", "5", "--print_config"])
@@ -137,7 +137,7 @@ def test_the_command_reads_the_config(pytestconfig: pytest.Config, capsys: pytes
     shown = yaml.safe_load(capsys.readouterr().out)
     network = shown["model"]["init_args"]["network"]
     assert network["wide_mm"] == 5
-    assert network["channels"] == [24, 48, 96, 128]  # the rest is kept
+    assert network["channels"] == [24, 48, 96, 128]  # the other settings are unchanged
     from data_synth.mask_data import MaskDataModule
 
     MaskDataModule(**shown["data"]["init_args"])

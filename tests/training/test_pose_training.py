@@ -1,4 +1,4 @@
-"""Training of the pose network, its logs, and the way to a pose file."""
+"""Training of the pose network, its logs, and export."""
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -36,7 +36,7 @@ Trained = tuple[Path, Path, PoseModule]
 
 
 def sample(seed: int, n_stacks: int = 2, n_slices: int = 5) -> dict[str, torch.Tensor]:
-    """One head's slices: noise, but with poses that fit together."""
+    """Slices of one head: noise images with consistent poses."""
     rng = np.random.default_rng(seed)
     stack = np.repeat(np.arange(n_stacks), n_slices)
     header = Rotation.random(n_stacks, random_state=seed).as_matrix()[stack]
@@ -105,9 +105,9 @@ def test_the_template_is_the_data_module_s(trained: Trained) -> None:
     assert trained[2].weeks == [25.0, 26.0]
 
 
-@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes to the same folder
 def test_resuming_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
-    """With the same disturbances of the poses, too."""
+    """This includes the same random disturbances of the poses."""
     assert_resuming_changes_nothing(lambda: PoseModule(**SMALL), TinyData, tmp_path)
 
 
@@ -169,7 +169,7 @@ def exact_step(batch: dict[str, torch.Tensor]) -> PoseStep:
 def test_losses_and_scores_of_true_poses() -> None:
     batch = sample(0)
     step = exact_step(batch)
-    assert float(point_loss(step, batch)) == pytest.approx(0.01)  # the root's softening
+    assert float(point_loss(step, batch)) == pytest.approx(0.01)  # the softening of the square root
     assert float(vote_loss(step, batch)) == 0.0
     true = as_pose(step.rotation, step.translation_mm)
     scores = summary([scores_of(true, true, batch)])
@@ -203,7 +203,7 @@ def test_starting_from_other_weights(trained: Trained, tmp_path: Path) -> None:
         torch.testing.assert_close(one, other.cpu())
     with pytest.raises(InputError, match=r"start_from: .* cannot be used"):
         PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
-    wider = PoseModule(replace(NETWORK, width=64), start_from=str(trained[1]))  # what fits is taken
+    wider = PoseModule(replace(NETWORK, width=64), start_from=str(trained[1]))  # only matching weights are taken
     torch.testing.assert_close(
         wider.network.get_parameter("encoder.stem.conv.weight"),
         trained[2].network.get_parameter("encoder.stem.conv.weight").cpu(),
@@ -224,7 +224,7 @@ def test_the_configuration_fits(pytestconfig: pytest.Config) -> None:
 def test_one_command_trains_both(
     pytestconfig: pytest.Config, capsys: pytest.CaptureFixture[str], config: str, setting: str
 ) -> None:
-    """Settings are read and shown."""
+    """The settings are read and printed."""
     path = pytestconfig.rootpath / "lightning_configs" / f"{config}.yaml"
     with pytest.raises(SystemExit) as done:
         pretrain.main(["fit", "--config", str(path), f"--model.network.{setting}", "64", "--print_config"])
@@ -232,14 +232,14 @@ def test_one_command_trains_both(
     shown = yaml.safe_load(capsys.readouterr().out)
     network = shown["model"]["init_args"]["network"]
     assert network[setting] == 64
-    assert network["channels"] == {"pose": [24, 48, 96], "prior": [32, 64, 96]}[config]  # the rest is kept
+    assert network["channels"] == {"pose": [24, 48, 96], "prior": [32, 64, 96]}[config]  # the rest is unchanged
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # jsonargparse's, of its own
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # raised inside jsonargparse
 def test_weights_that_cannot_be_started_from_are_refused_in_one_line(
     pytestconfig: pytest.Config, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The error of the model comes wrapped in one of jsonargparse."""
+    """jsonargparse wraps the error of the model in its own."""
     path = pytestconfig.rootpath / "lightning_configs" / "prior.yaml"
     file = tmp_path / "prior.safetensors"
     file.write_bytes(b"not weights")

@@ -1,4 +1,4 @@
-"""What a training writes down: scores and images by number of stacks; and that it survives a kill."""
+"""Logs of a prior training: scores and images by number of stacks; resuming after a kill."""
 
 import os
 import signal
@@ -77,7 +77,7 @@ class ValidatedByStacks(lightning.LightningDataModule):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """What TensorBoard has of two epochs."""
+    """TensorBoard's data of two epochs."""
     folder = tmp_path_factory.mktemp("logs")
     torch.manual_seed(0)
     run = trainer(folder, max_epochs=2)
@@ -121,11 +121,11 @@ def test_panel_of_a_network_without_a_gate() -> None:
     coarse, _, _, confidence, gate, prior, _, _ = shown.split(12, 1)
     assert bool((gate == 1).all())
     assert 0 < float(confidence.max()) < 1
-    assert torch.equal(prior, coarse)  # which stands for the prior here
+    assert torch.equal(prior, coarse)  # V_coarse takes the place of the prior here
 
 
 def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
-    """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
+    """Weights trained at 0.8 mm, from a prior file or from a run, cannot be trained further at 1 mm."""
     first = training.PriorModule(NETWORK)
     options: dict[str, Any] = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
     run = trainer(tmp_path, **options)
@@ -156,7 +156,7 @@ def steps_of(checkpoint: Path) -> int:
 
 @pytest.mark.slow
 def test_training_goes_on_after_a_kill(tmp_path: Path) -> None:
-    """Killed without warning after its second epoch at the earliest, and resumed for one epoch more."""
+    """The training is killed without warning after its second epoch at the earliest, and resumed for one more epoch."""
     process = run_training(tmp_path, "--trainer.max_epochs=1000")
     last = tmp_path / "prior" / "version_0" / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 300
@@ -165,13 +165,13 @@ def test_training_goes_on_after_a_kill(tmp_path: Path) -> None:
             if last.exists() and steps_of(last) >= 4:
                 break
         except (OSError, RuntimeError, EOFError):
-            pass  # being written
+            pass  # the file is being written
         time.sleep(0.1)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
-    done = steps_of(last)  # whole, although its writer was killed
+    done = steps_of(last)  # complete, although its writer was killed
     assert done >= 4
-    epochs = done // 2 + 1  # two steps each
+    epochs = done // 2 + 1  # two steps per epoch
     resumed = run_training(tmp_path, f"--trainer.max_epochs={epochs}", f"--ckpt_path={last}")
     words, _ = resumed.communicate(timeout=300)
     assert resumed.returncode == 0, words[-2000:]
@@ -197,7 +197,7 @@ def test_trainer_flags(tmp_path: Path, flags: list[str]) -> None:
 
 @pytest.mark.slow
 def test_another_anatomy_is_trained_with_the_same_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder of volumes with masks is enough for the prior; names need not hold an age."""
+    """A folder of volumes with masks is enough for the prior; names need no age."""
     generator = np.random.default_rng(0)
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
     mask = np.linalg.norm(index / [10, 8, 9], axis=-1) < 1

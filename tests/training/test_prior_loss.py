@@ -1,4 +1,4 @@
-"""The loss of the prior's training, and the symmetries that its batches are turned by."""
+"""The loss of the prior's training, and the random symmetries of its batches."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.training.small_volumes import sample
 
 
 def test_loss_weight_is_that_of_brain_band_and_background() -> None:
-    """1 in the brain and more where nothing was seen; outside little, and more next to the brain."""
+    """The weight is 1 in the brain, more in unseen parts, small outside, and larger next to the brain."""
     mask = torch.zeros(1, 1, 21, 21, 21)
     mask[0, 0, 10, 10, 9:11] = 1
     density = torch.full_like(mask, 50.0)
@@ -31,7 +31,7 @@ def test_loss_weight_is_that_of_brain_band_and_background() -> None:
 
 
 def test_the_loss_wants_the_median_where_slices_looked_and_the_mean_where_none_did() -> None:
-    """Of a voxel that is 0 in three heads and 1 in one, the least loss is at 0 if seen, at 1/4 if unseen."""
+    """For a voxel that is 0 in three heads and 1 in one, the loss is least at 0 if seen, and at 1/4 if unseen."""
     truth = torch.tensor([0.0, 0, 0, 1]).reshape(4, 1, 1, 1, 1)
     mask = torch.ones_like(truth)
     guesses = torch.linspace(0, 1, 101)
@@ -55,7 +55,7 @@ def test_the_loss_asks_for_the_brain_above_all_where_no_slice_looked() -> None:
     right, undecided = 12 * (mask - 0.5), 0 * mask
     assert loss(right, 0.0) < 0.01 * loss(undecided, 0.0)
     assert loss(undecided, 0.0) == pytest.approx(batches.BRAIN_FACTOR * np.log(2), rel=1e-5)
-    # one seen voxel, one unseen: the unseen one's answer counts more
+    # the unseen voxel counts more than the seen one
     batch = {"truth": truth, "mask": 0 * mask, "density": torch.tensor([30.0, 0.0]).reshape(truth.shape)}
     seen_wrong, unseen_wrong = (
         float(batches.prior_loss(PriorOutput(truth, 12 * (wrong - 0.5)), batch, torch.ones_like(truth)))

@@ -1,4 +1,4 @@
-"""Training, its logs, and the way from a training checkpoint to a prior file."""
+"""Training of the prior network, its logs, and export."""
 
 import subprocess
 import sys
@@ -89,7 +89,7 @@ def test_training_moves_the_weights(trained: Trained) -> None:
     assert float(trained[2].network.refiner.head.weight.detach().abs().max()) > 0
 
 
-@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes to the same folder
 def test_resuming_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
     assert_resuming_changes_nothing(lambda: training.PriorModule(**SMALL), TinyData, tmp_path)
 
@@ -166,7 +166,7 @@ def test_export_wants_the_ending_of_its_format(
 def test_a_network_of_another_density_is_for_comparison_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """g3r-infer would show it the coverage."""
+    """g3r-infer would give such a network the wrong density, that of whole slices."""
     module = training.PriorModule(**SMALL, density="masked")
     done = trainer(tmp_path, max_steps=1)
     done.fit(module, TinyData())
@@ -210,7 +210,7 @@ def test_the_template_s_voxels_must_agree_with_the_data(tmp_path: Path) -> None:
 
 
 def test_a_patch_can_be_learnt() -> None:
-    """Sixty steps on one patch bring the prior's error to half the coarse volume's."""
+    """Sixty steps on one patch reduce the prior's error to half that of V_coarse."""
     torch.manual_seed(0)
     module = training.PriorModule(**SMALL, learning_rate=3e-3)
     batch = {name: value[None] for name, value in sample(0, size=24).items()}
@@ -229,12 +229,12 @@ def test_a_patch_can_be_learnt() -> None:
 
 @pytest.mark.parametrize("use_template", [False, True])
 def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_template: bool) -> None:
-    """On another base the residual begins at zero; the template is the data's, not the file's."""
+    """With another base the residual starts at zero; the template is that of the data, not of the file."""
     torch.manual_seed(0)
     old = DensityGatedPriorNetwork(replace(NETWORK, use_template=use_template))
     torch.nn.init.normal_(old.refiner.head.weight)
     path = tmp_path / "old.safetensors"
-    old.set_template(torch.rand(3, 2, 2, 2))  # of another shape, and not taken
+    old.set_template(torch.rand(3, 2, 2, 2))  # another shape, which must not be taken
     Prior(network=old, voxel_mm=0.8, weeks=(25.0, 28.0, 31.0), training_data="noise").save(path)
     given = given_at_random(8, 8, 8)
     new = training.PriorModule(NETWORK, start_from=str(path)).network
@@ -244,7 +244,7 @@ def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_templat
             torch.testing.assert_close(one, other)
     else:
         torch.testing.assert_close(new(given).volume, given.base(NETWORK))
-        # channels that the file lacks have no effect at first
+        # channels that the file lacks start without effect
         shown = replace(given, template=torch.rand(1, 1, 8, 8, 8))
         new.refiner.head.load_state_dict(old.refiner.head.state_dict())
         torch.testing.assert_close(new.refiner(shown)[0], old.refiner(given)[0])
@@ -259,7 +259,7 @@ def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_templat
 
 
 def test_learning_rate_follows_the_budget_that_ends_first(tmp_path: Path) -> None:
-    """With many steps but no time left, the rate is at its end."""
+    """With many steps left but no time, the rate is at its final value."""
     module = training.PriorModule(**SMALL)
     run = trainer(tmp_path, max_steps=-1, max_epochs=10_000, max_time=timedelta(seconds=2))
     run.fit(module, TinyData())

@@ -1,4 +1,4 @@
-"""Scores of a validation: over the brain, by confidence, and by place."""
+"""Validation scores: over the brain, by confidence, and by place."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_errors_by_confidence_are_of_the_brain_alone() -> None:
 
 @pytest.mark.parametrize("voxel_mm", [0.8, 1.2])
 def test_validation_tells_rim_from_depth_and_seen_from_unseen(voxel_mm: float) -> None:
-    """An error of 0.1 in the rim and of 0.01 within; the upper half is unseen."""
+    """The error is 0.1 in the rim and 0.01 inside; the upper half is unseen."""
     mask = torch.zeros(1, 1, 24, 24, 24)
     mask[:, :, 2:22, 2:22, 2:22] = 1
     deep = torch.zeros_like(mask)

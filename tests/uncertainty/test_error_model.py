@@ -1,4 +1,4 @@
-"""The error model: finds what is there, never falls as doubt grows, survives a file."""
+"""The error model: recovers known coefficients, is monotonic in every predictor, survives a file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR, cal
 
 
 def predictors(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Evidence over the range that reconstructions show."""
+    """Predictors over the range of real reconstructions."""
     return {
         "unmeasured": rng.uniform(0, 1, n),
         "from_prior": rng.exponential(0.02, n),
@@ -38,7 +38,7 @@ def test_known_model_is_found_again() -> None:
     samples = {"a": rng.normal(size=40_000), "b": rng.uniform(0, 1, 40_000)}
     mean = np.exp(-3 + 0.5 * samples["a"] + 1.5 * samples["b"])
     found = fit_model(samples, rng.exponential(mean))
-    # 40,000 exponential draws tell the coefficients to about 1 / sqrt(40,000)
+    # 40,000 exponential draws determine the coefficients to about 1 / sqrt(40,000)
     assert found.intercept == pytest.approx(-3, abs=0.03)
     assert found.coefficients["a"] == pytest.approx(0.5, abs=0.02)
     assert found.coefficients["b"] == pytest.approx(1.5, abs=0.05)
@@ -59,7 +59,7 @@ def test_weights_count_like_repetition() -> None:
     twice = np.r_[np.arange(300), np.arange(150)]
     weighted = fit_model({"x": x}, error, np.r_[np.full(150, 2.0), np.ones(150)])
     repeated = fit_model({"x": x[twice]}, error[twice])
-    # the columns are scaled by their spread before the ridge, which repetition changes a little
+    # the columns are scaled by their spread before the ridge, and repetition changes the spread slightly
     assert weighted.intercept == pytest.approx(repeated.intercept, abs=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The map of a small fit: finite, in the volume's units, larger where slices disagree or are missing."""
+"""Uncertainty map of a small fit: finite, in the volume's units, larger where slices disagree or are missing."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def mask(grid: VolumeGrid) -> np.ndarray:
 
 
 def fit_of(noise: float) -> SliceFit:
-    """Axial slices of a few Gaussians; the upper half of the head carries noise."""
+    """A fit to axial slices of a few Gaussians, with noise in the upper half of the head."""
     rng = np.random.default_rng(0)
     identity = np.tile([1.0, 0, 0, 0], (200, 1))
     cloud = cloud_of(rng.uniform(-7, 7, (200, 3)), np.full((200, 3), 0.6), identity, np.full(200, 0.3))
@@ -72,7 +72,7 @@ def test_residual_is_where_the_noise_is(grid: VolumeGrid) -> None:
     fit = fit_of(0.1)
     found = mean_residual(fit, grid)
     assert found.shape == grid.shape
-    # mean absolute value of a normal deviate: 0.8 of its deviation
+    # the mean absolute value of a normal deviate is 0.8 standard deviations
     assert np.median(found[6:18, 6:18, 14:17]) == pytest.approx(0.08, rel=0.15)
     assert np.median(found[6:18, 6:18, 3:6]) < 0.02
 
@@ -145,5 +145,5 @@ def test_evidence_in_a_corner_of_the_grid(grid: VolumeGrid) -> None:
     flat = np.full(grid.shape, 0.5, np.float32)
     found = gather_predictors(flat, corner, grid, residual=flat, density=flat, prior=flat, prior_share=None)
     assert {len(values) for values in found.values()} == {27}
-    assert found["edge"].max() < 1e-6  # the rim of the mask is no edge of the brain
+    assert found["edge"].max() < 1e-6  # the rim of the mask does not count as an edge of the image
     assert found["depth_mm"].min() == 1.0

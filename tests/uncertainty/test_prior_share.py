@@ -1,4 +1,4 @@
-"""The share of the prior: 1 where nothing was measured, small where three stacks were, as refitting says."""
+"""The prior share: 1 where nothing was measured, small with three stacks, and consistent with refitting."""
 
 from dataclasses import replace
 
@@ -25,13 +25,13 @@ def volume() -> np.ndarray:
 
 
 def half_measured() -> Slices:
-    """Three stacks of which nothing above the middle is in a mask."""
+    """Three stacks whose masks are empty above the middle."""
     slices = make_slices()
     return replace(slices, mask=slices.mask & (slices.planes.pixel_world_mm()[:, 2] < 0))
 
 
 def whole_fit(prior: np.ndarray, slices: Slices) -> tuple[SliceFit, np.ndarray, np.ndarray]:
-    """Both stages from a prior volume, and the volumes that come out of the first and of the second."""
+    """Both stages from a prior volume, and the volumes after the first and after the second."""
     rng = np.random.default_rng(0)
     whole = VolumeTarget.of(prior, BALL.astype(np.float32), GRID)
     cloud, _ = fit_prior(seeded(prior), whole, PriorStageSettings(n_steps=15), rng)
@@ -63,14 +63,14 @@ def test_the_share_is_what_refitting_to_another_prior_says(volume: np.ndarray) -
     change = gaussian_filter(np.random.default_rng(5).standard_normal(GRID.shape), 1.6)
     change = (0.03 * change / change.std() * BALL).astype(np.float32)
     _, other_first, other_last = whole_fit(volume + change, slices)
-    change, answer = other_first - first, other_last - last  # as far as Gaussians can show the change
+    change, answer = other_first - first, other_last - last  # as far as Gaussians can represent the change
     kept = {
         name: float((answer * change)[part].sum() / (change**2)[part].sum())
         for name, part in (("upper", UPPER & BALL), ("lower", LOWER & BALL))
     }
-    # the map errs towards the prior, and not by much
+    # the map errs slightly towards the prior
     assert kept["lower"] - 0.03 < share[LOWER & BALL].mean() < kept["lower"] + 0.15
-    # where nothing is measured a second fit does not repeat every detail; nothing but the prior speaks there
+    # without data, a second fit does not repeat every detail, although it rests on the prior alone
     assert kept["upper"] > 0.5
     assert share[UPPER & BALL].mean() > 0.9
     assert (share[~BALL] == 1).all()

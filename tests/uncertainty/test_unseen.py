@@ -1,4 +1,4 @@
-"""What is said of the part of the brain that no slice saw."""
+"""Messages about the unseen part of the brain."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_no_brain_is_no_division_by_zero() -> None:
 
 
 def test_a_cut_head_of_unknown_size_must_not_be_used() -> None:
-    """However little of what is called brain is unseen."""
+    """This holds however small the unseen share of the mask is."""
     nothing = np.zeros_like(BRAIN)
     found = UnseenPart.of(nothing, BRAIN, 8.0, shown="smooth continuation", share_by_areas=0.43, has_template=False)
     assert found.share == 0
