@@ -15,7 +15,7 @@ from g3r.fitting.lattice_mean import mean_cloud
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.maps import VolumeMaps, estimate_maps
 from g3r.output.mixture import FinishedVolume
-from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
+from g3r.output.record import LOSS_ROSE, RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
 from g3r.output.stage_results import StageResults
@@ -147,7 +147,7 @@ def _record(
     n_rollbacks = sum("rollback" in entry for entry in fit.history)
     if n_rollbacks:
         run.warnings.append(
-            f"the loss of the fit rose: {n_rollbacks} times it went back to its best state and on "
+            f"{LOSS_ROSE}: {n_rollbacks} times it went back to its best state and on "
             "with shorter steps; look at the volume"
         )
     for warning in run.warnings:

@@ -11,7 +11,16 @@ from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import PRESETS
-from g3r.registration.quality import PARALLEL
+from g3r.registration.quality import (
+    FAILED,
+    JUDGED,
+    LEFT_OUT,
+    NO_SLICE,
+    PARALLEL,
+    PERHAPS_MIRRORED,
+    PROBABLY_MIRRORED,
+    pose_warnings,
+)
 from g3r.registration.stack_quality import StackQuality
 from g3r.report.verdict import verdict_of
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE
@@ -197,6 +206,26 @@ def test_a_warning_with_words_of_its_own_is_not_said_twice() -> None:
     ]
     found = record(stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
     assert len(verdict_of(found).reasons) == 3
+
+
+def test_warnings_about_a_quality_are_those_that_the_verdict_says_otherwise() -> None:
+    """Each start begins a warning of registration, and the verdict has one reason for it."""
+    mirrored = replace(quality(False), handedness=-0.13)
+    judged = {
+        LEFT_OUT: replace(mirrored, left_out=True),
+        NO_SLICE: StackQuality(False, None, None, 0.0),
+        PERHAPS_MIRRORED: replace(mirrored, reliable=True),
+        PROBABLY_MIRRORED: mirrored,
+        FAILED: quality(False, 0.31),
+    }
+    assert set(judged) == set(JUDGED)
+    for start, one in judged.items():
+        named: Any = stack("c.nii", one)
+        registration: Any = None
+        (line,) = pose_warnings(registration, [one], [named])
+        assert line.startswith(f"c.nii: {start}")
+        found = stacks_with(named)
+        assert verdict_of(replace(found, warnings=[line])) == verdict_of(found)
 
 
 def test_stacks_that_agree_about_as_well_as_each_other_are_not_mentioned() -> None:
