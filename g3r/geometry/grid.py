@@ -83,9 +83,7 @@ class VolumeGrid:
 
     def moved(self, pose: RigidPose) -> VolumeGrid:
         """The same voxels after a rigid motion of the world (one pose)."""
-        motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = pose.rotation[0], pose.translation_mm[0]
-        return VolumeGrid(self.shape, motion @ self.affine)
+        return VolumeGrid(self.shape, pose.matrix[0] @ self.affine)
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:

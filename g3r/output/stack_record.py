@@ -79,9 +79,8 @@ class StackRecord:
 
 def mean_motion(slices: Slices) -> list[list[float]]:
     """Robust mean of the rigid motions [4, 4] (RAS, mm) that take points from where headers put them to the poses."""
-    matrix, motion = np.eye(4), motion_to_headers(slices).inverse()
-    matrix[:3, :3], matrix[:3, 3] = motion.rotation[0], motion.translation_mm[0]
-    return [[round(float(x), 9) for x in row] for row in matrix]
+    motion = motion_to_headers(slices).inverse()
+    return [[round(float(x), 9) for x in row] for row in motion.matrix[0]]
 
 
 def stack_records(
