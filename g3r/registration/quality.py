@@ -27,6 +27,9 @@ FAILED = "registration probably failed"
 JUDGED = (LEFT_OUT, NO_SLICE, PERHAPS_MIRRORED, PROBABLY_MIRRORED, FAILED)
 """Starts, after the stack's name, of warnings about a quality that the verdict has a message of its own for."""
 
+WITHOUT_SLICES = StackQuality(reliable=False, held_out_correlation=None, median_slice_ncc=None, downweighted_share=0.0)
+"""Quality of a stack without slices."""
+
 
 def unknown_orientation_note(slices: Slices) -> str:
     """Why a volume stays in scanner space though the standard orientation was asked for."""
@@ -43,7 +46,7 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
     for n in range(n_stacks):
         of_stack = registration.slices.stack_id == n
         if n not in present:
-            found.append(left_out.get(n, StackQuality(False, None, None, 0.0)))
+            found.append(left_out.get(n, WITHOUT_SLICES))
             continue
         place = present.index(n)
         held_out = None if registration.held_out is None else registration.held_out[place]

@@ -20,9 +20,9 @@ from g3r.registration.quality import (
     PARALLEL,
     PERHAPS_MIRRORED,
     PROBABLY_MIRRORED,
+    WITHOUT_SLICES,
     pose_warnings,
 )
-from g3r.registration.stack_quality import StackQuality
 from g3r.report.verdict import verdict_of
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE
 from g3r.run.context import StoppedAt
@@ -97,7 +97,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         CHECK,
         "c.nii was left out: it is probably a mirror image of what the other stacks show (handedness -0.13)",
     ),
-    "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
+    "not used": (stacks_with(stack("c.nii", WITHOUT_SLICES)), DO_NOT_USE, "c.nii was not used"),
     "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
     "doubtful by a hair": (
         stacks_with(stack("c.nii", quality(True, 0.6799))),
@@ -105,7 +105,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         "c.nii agrees only just with the other stacks (0.67; good is 0.68 and above)",
     ),
     "unlike": (
-        stacks_with(stack("c.nii", StackQuality(True, 0.81, 0.82, 0.0))),
+        stacks_with(stack("c.nii", quality(True, 0.81, 0.82))),
         CHECK,
         "the slices of c.nii agree with the volume by 0.82, those of another stack by 0.95",
     ),
@@ -214,7 +214,7 @@ def test_warnings_about_a_quality_are_those_that_the_verdict_says_otherwise() ->
     mirrored = replace(quality(False), handedness=-0.13)
     judged = {
         LEFT_OUT: replace(mirrored, left_out=True),
-        NO_SLICE: StackQuality(False, None, None, 0.0),
+        NO_SLICE: WITHOUT_SLICES,
         PERHAPS_MIRRORED: replace(mirrored, reliable=True),
         PROBABLY_MIRRORED: mirrored,
         FAILED: quality(False, 0.31),
@@ -230,8 +230,8 @@ def test_warnings_about_a_quality_are_those_that_the_verdict_says_otherwise() ->
 
 
 def test_stacks_that_agree_about_as_well_as_each_other_are_not_mentioned() -> None:
-    assert verdict_of(stacks_with(stack("c.nii", StackQuality(True, 0.8, 0.9, 0.0)))).word == USE
-    failed = verdict_of(stacks_with(stack("c.nii", StackQuality(False, 0.4, 0.5, 0.0))))
+    assert verdict_of(stacks_with(stack("c.nii", quality(True, 0.8, 0.9)))).word == USE
+    failed = verdict_of(stacks_with(stack("c.nii", quality(False, 0.4, 0.5))))
     assert len(failed.reasons) == 1
 
 
