@@ -87,7 +87,7 @@ class GlobalSearch:
                 best = found
             lowest = min(_score(best).correlations)
             finished = lowest >= RETRY_BELOW_CORRELATION or not self.settings.segments
-            if finished or (deadline is not None and deadline.has_passed()):
+            if finished or (deadline is not None and deadline.record_whether_passed()):
                 break
             logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
         assert best is not None
