@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from g3r._version import __version__
 from g3r.cli.completion import parsed
 from g3r.cli.failures import INTERRUPTED, is_out_of_memory, run_command
-from g3r.errors import G3RError, InputError
+from g3r.errors import G3RError, InputError, one_line
 
 if TYPE_CHECKING:
     from g3r.checkpoints.trained_model import TrainedModel
@@ -88,8 +88,7 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
     except Exception as error:  # a network with unexpected values may raise anything
         if is_out_of_memory(error):
             raise
-        found = " ".join(str(error).split())[:120]
-        raise InputError(f"{run}: cannot be exported ({found}); export another checkpoint") from error
+        raise InputError(f"{run}: cannot be exported ({one_line(error)}); export another checkpoint") from error
 
 
 def _model_types() -> dict[str, type[TrainedModel]]:

@@ -65,7 +65,7 @@ class Deadline:
         return replace(self, end_s=self.clock() + share * max(0.0, self.remaining_s - reserve_s))
 
     def record_whether_passed(self) -> bool:
-        """Whether no time is left by the clock, which the loop record keeps; if loops are replayed, what it has kept."""
+        """Whether no time is left by the clock, kept in the loop record; as kept there if loops are replayed."""
         if self.loop_record is None:
             return self.remaining_s <= 0
         known = self.loop_record.begin()
