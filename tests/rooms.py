@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians registration output",
     "report": "geometry run acquisition registration planning output reuse",
-    "bids": "geometry run acquisition",
+    "bids": "geometry run acquisition report",
     "reconstruct": "run acquisition checkpoints registration fitting planning networks output report",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (

@@ -128,7 +128,7 @@ def _mask(path: str, target: Path, masker: Masker) -> str:
         raise InputError(f"{volume.name}: {found}; draw the mask by hand, or try --mask-command")
     stack = load_stack(path, found, float(volume.grid.spacing_mm.max()))
     save_mask_picture(target.with_name(f"{target.name}.png"), [stack])
-    volume_ml = found.volume_ml(volume)
+    volume_ml = volume.grid.volume_ml(found.inside)
     target.with_name(f"{target.name}.json").write_text(_record(path, found, volume_ml), encoding="utf-8")
     save_volume(target.with_name(f"{target.name}.nii.gz"), found.inside, volume.affine)
     return f"{target}.nii.gz: {volume_ml:.0f} ml, {found.source} ({found.detail})"

@@ -95,6 +95,10 @@ class VolumeGrid:
         """Volume of a voxel."""
         return float(abs(np.linalg.det(self.affine[:3, :3])))
 
+    def volume_ml(self, mask: NDArray[np.bool_]) -> float:
+        """Volume of a mask [I, J, K] on the grid."""
+        return np.count_nonzero(mask) * self.voxel_volume_mm3 / 1000
+
     @property
     def center_mm(self) -> NDArray[np.float64]:
         """World position of the middle of the grid [3]."""

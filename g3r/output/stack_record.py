@@ -111,7 +111,7 @@ def stack_records(
             spacing_mm=[round(float(x), 6) for x in stack.spacing_mm],
             mask_from=stack.mask_source,
             mask_detail=stack.mask_detail,
-            mask_ml=round(float(stack.mask.sum()) * stack.grid.voxel_volume_mm3 / 1000, 1),
+            mask_ml=round(stack.grid.volume_ml(stack.mask), 1),
             left_out_share=round(left_out_share(stack), 3),
             remarks=list(stack.remarks),
             n_slices=int((stack_id == n).sum()),
