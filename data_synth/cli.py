@@ -7,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from g3r._version import __version__
-from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.failures import INTERRUPTED, run_command
+
+PROG = "g3r-simulate"
 
 BRIGHT = 1000.0
 """The 99.5th percentile of the truth in the mask; stacks are int16."""
@@ -29,24 +31,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--stacks {arguments.stacks}; expected at least 1")
     if arguments.seed < 0:
         parser.error(f"--seed {arguments.seed}; expected 0 or above")
-    try:
-        line = _simulate(arguments)
-    except KeyboardInterrupt:
-        return _failed("interrupted; no simulation was written", 130)
-    except EXPECTED as error:
-        return _failed(*line_and_code(error, LESS_MEMORY))
-    print(line)
-    return 0
-
-
-def _failed(line: str, exit_code: int) -> int:
-    print(f"g3r-simulate: {line}", file=sys.stderr)
-    return exit_code
+    return run_command(
+        PROG,
+        lambda: _simulate(arguments),
+        interrupted=lambda: ("interrupted; no simulation was written", INTERRUPTED),
+        less_memory=LESS_MEMORY,
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="g3r-simulate", description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        prog=PROG, description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     source = parser.add_mutually_exclusive_group(required=True)
@@ -69,8 +64,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _simulate(arguments: argparse.Namespace) -> str:
-    """Simulate and write the stacks; return the line to print."""
+def _simulate(arguments: argparse.Namespace) -> int:
+    """Simulate and write the stacks, and print a line about them; returns the exit code."""
     import numpy as np
 
     from data_synth.atlas import AtlasSubject, cropped
@@ -112,7 +107,8 @@ def _simulate(arguments: argparse.Namespace) -> str:
     save_simulation(arguments.output, truth, stacks, record, replace=arguments.force)
     n_slices = sum(len(one.true_pose) for one in stacks)
     made_of = f"{len(stacks)} stacks, {n_slices} slices, motion {arguments.motion}"
-    return f"{arguments.output}: {made_of}, from {truth.name}"
+    print(f"{arguments.output}: {made_of}, from {truth.name}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -32,6 +32,12 @@ class NumericalError(G3RError):
     exit_code = 4
 
 
+def one_line(error: BaseException) -> str:
+    """The first 120 characters of an error's text, without line breaks; the name of its type if it has no text."""
+    text = " ".join(str(error).split())
+    return text[:120] if text else type(error).__name__
+
+
 def cannot_be_written(path: str | os.PathLike[str], error: OSError, needed_bytes: int | None = None) -> InputError:
     """The error to raise where a file or folder could not be written.
 

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "geometry": "run",
     "acquisition": "geometry run",
     "checkpoints": "run",
-    "dicom": "run acquisition",
+    "dicom": "geometry run acquisition",
     "gaussians": "geometry run acquisition",
     "prior": "geometry acquisition checkpoints",
     "pose_network": "geometry acquisition checkpoints",
@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians registration output",
     "report": "geometry run acquisition registration planning output reuse",
-    "bids": "run acquisition",
+    "bids": "geometry run acquisition report",
     "reconstruct": "run acquisition checkpoints registration fitting planning networks output report",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -96,6 +97,28 @@ MAX_LINES = 300
 @pytest.mark.parametrize("path", SOURCES, ids=relative)
 def test_no_file_is_long(path: Path) -> None:
     assert len(path.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+
+
+KEYWORD_ONLY_FROM = 5
+"""Fields of a record; places of so many are mixed up."""
+
+
+def fields_of_records(path: Path) -> Iterator[tuple[str, int, bool]]:
+    """Name, number of fields of its own, and whether it is keyword-only, of each dataclass in a file."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.ClassDef):
+            continue
+        decorators = [ast.unparse(one) for one in node.decorator_list]
+        if any(one.split("(")[0] == "dataclass" for one in decorators):
+            n_fields = sum(isinstance(line, ast.AnnAssign) for line in node.body)
+            yield node.name, n_fields, any("kw_only=True" in one for one in decorators)
+
+
+@pytest.mark.parametrize("folder", ["g3r", "data_synth", "studies"])
+def test_records_with_many_fields_are_keyword_only(folder: str) -> None:
+    for path in in_package(folder):
+        for name, n_fields, keyword_only in fields_of_records(path):
+            assert keyword_only or n_fields < KEYWORD_ONLY_FROM, f"{relative(path)}: {name}"
 
 
 def modules_after(statement: str, *wanted: str) -> set[str]:

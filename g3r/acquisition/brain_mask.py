@@ -43,10 +43,6 @@ class FoundMask:
     source: MaskSource
     detail: str = ""
 
-    def volume_ml(self, volume: Volume) -> float:
-        """Volume of the mask (ml) on the grid of an image."""
-        return float(np.count_nonzero(self.inside) * volume.grid.voxel_volume_mm3 / 1000)
-
     def hash(self) -> FileHash:
         """Hash that identifies a mask which is not a file."""
         return FileHash(self.source, hashlib.sha256(np.packbits(self.inside).tobytes()).hexdigest())

@@ -65,7 +65,7 @@ LIKELY, POSSIBLE = 0.5, 0.25
 voxel that is left out costs as much as many that are a little wrong."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Foreground:
     """State of each voxel by the slices and their masks.
 
@@ -148,7 +148,7 @@ class Foreground:
         return binary_fill_holes(brain)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Votes:
     """Votes of the masks of slices in place for each voxel, before the brain share is computed.
 
@@ -196,7 +196,18 @@ class Votes:
             raise InputError("no voxel is covered by a slice; check masks and headers")
         rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
         core = seen & (inside > CORE_SHARE * total)
-        return cls(slices, grid, counts, brain, core, ~seen, thin, density, rough, distance_voxels)
+        return cls(
+            slices=slices,
+            grid=grid,
+            weight=counts,
+            brain=brain,
+            core=core,
+            unseen=~seen,
+            thin=thin,
+            density=density,
+            rough=rough,
+            distance_voxels=distance_voxels,
+        )
 
     def foreground(self) -> Foreground:
         """The foreground, with the brain share, which takes longer than all else."""
@@ -209,7 +220,15 @@ class Votes:
         else:
             rim_voxels = max(1, round(SINGLE_RIM_MM / voxel_mm))
         possible_voxels = max(1, round(POSSIBLE_MM / voxel_mm))
-        return Foreground(self.brain, self.core, share, self.unseen, self.thin, rim_voxels, possible_voxels)
+        return Foreground(
+            brain=self.brain,
+            core=self.core,
+            share=share,
+            unseen=self.unseen,
+            thin=self.thin,
+            rim_voxels=rim_voxels,
+            possible_voxels=possible_voxels,
+        )
 
 
 def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Foreground:

@@ -17,7 +17,7 @@ import numpy as np
 from nibabel.arrayproxy import ArrayProxy
 from numpy.typing import NDArray
 
-from g3r.errors import InputError
+from g3r.errors import InputError, one_line
 from g3r.geometry import VolumeGrid
 
 MAX_VOXEL_COUNT = 2**28
@@ -158,12 +158,6 @@ def orientation_remarks(image: NiftiImage, grid: VolumeGrid) -> list[str]:
     if apart_mm <= HEADERS_AGREE_VOXELS * grid.spacing_mm.min():
         return []
     return [f"sform and qform differ by up to {apart_mm:.3g} mm; the sform is used"]
-
-
-def one_line(error: BaseException) -> str:
-    """The first 120 characters of an error's text, without line breaks."""
-    text = " ".join(str(error).split())
-    return text[:120] if text else type(error).__name__
 
 
 def _check_file(path: Path) -> None:

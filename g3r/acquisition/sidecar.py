@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from g3r.acquisition.nifti import NIFTI_ENDINGS, one_line
+from g3r.acquisition.nifti import NIFTI_ENDINGS
 from g3r.acquisition.psf import THICKNESS_RANGE_MM
-from g3r.errors import InputError
+from g3r.errors import InputError, one_line
 
 MAX_SIDECAR_BYTES = 10_000_000
 

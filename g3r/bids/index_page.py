@@ -8,7 +8,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from g3r.bids.derivative import REPORT, THUMBNAIL, figure_path
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, USE, Outcome, log_path
+from g3r.bids.outcome import FAILED, NOT_RUN, Outcome, log_path
+from g3r.report.verdict_messages import CHECK, DO_NOT_USE, USE
 from g3r.run.atomic_file import write_text
 
 PAGE = "index.html"

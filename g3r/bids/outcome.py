@@ -10,11 +10,11 @@ from g3r.bids.dataset import Session
 from g3r.bids.derivative import record_path
 from g3r.bids.description import LOGS, as_json, read_object
 from g3r.errors import InputError
+from g3r.report.verdict_messages import MILDEST_FIRST
 from g3r.run.atomic_file import write_text
 
 FAILED, NOT_RUN = "failed", "not run"
-DO_NOT_USE, CHECK, USE = "do not use", "check", "use"
-"""Words of the verdict in run.json."""
+"""Words of a session without a verdict."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ def _of_record(session: Session, record: dict[str, Any], name: str) -> Outcome:
     n_slices = sum(one.get("n_slices", 0) for one in stacks)
     unseen = record.get("unseen") or {}
     verdict = record.get("verdict")
-    if verdict not in (DO_NOT_USE, CHECK, USE):
+    if verdict not in MILDEST_FIRST:
         raise InputError(f"{name}: holds no verdict; an earlier version of g3r wrote it")
     return Outcome(
         session=session,

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""ITK's axes point to the left and to the back."""
+from g3r.geometry.lps import LPS_FROM_RAS
 
 
 def itk_text(standard_from_scanner: Sequence[Sequence[float]]) -> str:

@@ -79,11 +79,6 @@ def named_numbers(content: Mapping[str, Any], key: str) -> dict[str, float]:
     return {name: number(found, name) for name in found}
 
 
-def one_line(error: BaseException) -> str:
-    """Return the first 120 characters of an error's text without line breaks."""
-    return " ".join(str(error).split())[:120]
-
-
 def shown(value: object) -> str:
     """A value for a message, shortened."""
     if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**30):

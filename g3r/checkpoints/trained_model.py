@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from g3r._version import __version__
-from g3r.checkpoints.plain_values import config_from_plain, named_numbers, one_line, shown, text
+from g3r.checkpoints.plain_values import config_from_plain, named_numbers, shown, text
 from g3r.checkpoints.shipped import weights_path
 from g3r.checkpoints.weights_file import WeightsFile, another_file, read_weights, write_weights
-from g3r.errors import G3RError, InputError
+from g3r.errors import G3RError, InputError, one_line
 from g3r.run.on_demand import torch
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from g3r._version import __version__
-from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
-from g3r.errors import InputError
+from g3r.cli.failures import INTERRUPTED, run_command
 
 COMMANDS = {
     "kernels": "pair and pixel rates of the renderer, against what the machine can do",
@@ -40,26 +39,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     name = build_parser().parse_args(words[:1]).command
     module = import_module(f"g3r.bench.{name}")
+    prog = f"g3r-bench {name}"
     parser = argparse.ArgumentParser(
-        prog=f"g3r-bench {name}",
-        description=f"Measure {COMMANDS[name]}.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        prog=prog, description=f"Measure {COMMANDS[name]}.", formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     module.add_arguments(parser)
     options = parser.parse_args(words[1:])
-    logging.basicConfig(level=logging.WARNING, format=f"g3r-bench {name}: %(message)s", stream=sys.stderr)
-    try:
-        return int(module.run(options))
-    except ModuleNotFoundError as error:
-        print(f"g3r-bench {name}: {missing_extra(error)}", file=sys.stderr)
-        return InputError.exit_code
-    except EXPECTED as error:
-        line, exit_code = line_and_code(error)
-        print(f"g3r-bench {name}: {line}", file=sys.stderr)
-        return exit_code
-    except KeyboardInterrupt:
-        print(f"g3r-bench {name}: interrupted; whatever was measured until now is in --output", file=sys.stderr)
-        return 130
+    logging.basicConfig(level=logging.WARNING, format=f"{prog}: %(message)s", stream=sys.stderr)
+    line = "interrupted; whatever was measured until now is in --output"
+    return run_command(prog, lambda: int(module.run(options)), interrupted=lambda: (line, INTERRUPTED))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from g3r._version import __version__
 from g3r.cli.completion import parsed
-from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
+from g3r.cli.failures import run_command
 from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
 from g3r.run.hidden_folders import name_alone
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from g3r.bids.dataset import Session
     from g3r.bids.executor import Executor
     from g3r.bids.slurm_request import SlurmRequest
+
+PROG = "g3r-bids"
 
 FAILED = 1
 """Exit code if a session failed and the others are done."""
@@ -36,7 +38,7 @@ OURS = (
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = argparse.ArgumentParser(
-        prog="g3r-bids",
+        prog=PROG,
         description="Reconstruct every session of a BIDS data set, one process of g3r-infer each, and write a "
         "derivative data set. Sessions that are done are not done again; runs that were cut short go on. For research "
         "only, not for diagnosis.",
@@ -89,15 +91,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     let_threads_sleep()
     stop_request = StopRequest()
-    try:
+
+    def work() -> int:
         with stop_request:
             return _run(options, infer, tuple(words[cut + 1 :]), _command(words))
-    except KeyboardInterrupt:
-        return _said("interrupted; what was done stays, and the same command goes on", stop_request.exit_code)
-    except ModuleNotFoundError as error:
-        return _said(missing_extra(error), InputError.exit_code)
-    except EXPECTED as error:
-        return _said(*line_and_code(error))
+
+    line = "interrupted; what was done stays, and the same command goes on"
+    return run_command(PROG, work, interrupted=lambda: (line, stop_request.exit_code))
 
 
 def _slurm_request(text: str) -> SlurmRequest:
@@ -122,7 +122,7 @@ def _infer_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> arg
 
 def _command(words: Sequence[str]) -> str:
     """The command line with names of files and folders alone: it stays in a data set that is passed on."""
-    return shlex.join(["g3r-bids", *map(name_alone, words)])
+    return shlex.join([PROG, *map(name_alone, words)])
 
 
 def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tuple[str, ...], command: str) -> int:
@@ -208,11 +208,6 @@ def _table(options: argparse.Namespace, sessions: list[Session]) -> int:
     counts = ", ".join(f"{of_asked.count(verdict)} {verdict}" for verdict in dict.fromkeys(sorted(of_asked)))
     print(f"{path}: {counts}")
     return FAILED if FAILED_VERDICT in of_asked else 0
-
-
-def _said(line: str, exit_code: int) -> int:
-    print(f"g3r-bids: {line}", file=sys.stderr)
-    return exit_code
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r.cli.mask_options import AUTO
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,10 +22,6 @@ if TYPE_CHECKING:
     from g3r.output.result import ReconstructionResult
 
 logger = logging.getLogger(__name__)
-
-
-AUTO = ["auto"]
-"""Value of --masks by which the masks of all series are found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +88,7 @@ def check_dicom_options(parser: argparse.ArgumentParser, options: argparse.Names
     if options.keep_header_text:
         parser.error("--keep-header-text excludes --dicom: nothing of its headers is kept")
     several = options.thickness is not None and len(options.thickness) > 1
-    if not options.series and (several or options.masks not in (None, AUTO)):
+    if not options.series and (several or options.masks not in (None, [AUTO])):
         name = "--thickness" if several else "--masks"
         parser.error(f"{name} for each series needs --series, in the same order; --dry-run lists the series")
     if options.series and len(set(options.series)) < len(options.series):

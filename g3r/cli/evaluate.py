@@ -13,18 +13,20 @@ from typing import TYPE_CHECKING, Any
 from g3r._version import __version__
 from g3r.cli import held_out
 from g3r.cli.completion import parsed
-from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
+from g3r.cli.failures import INTERRUPTED, run_command
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.evaluation.compare import Comparison
     from g3r.evaluation.pose_error import PoseError
 
+PROG = "g3r-evaluate"
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = argparse.ArgumentParser(
-        prog="g3r-evaluate",
+        prog=PROG,
         description="Score a volume against a reference inside the reference's mask: PSNR, SSIM, NCC, RMSE "
         "after an affine fit of the intensities. Or, where there is no truth, by how well it predicts a stack that it "
         "was not made from (--held-out-stack), or each stack from the others (--leave-one-out).",
@@ -52,23 +54,15 @@ def main(argv: list[str] | None = None) -> int:
     if (options.poses is None) != (options.slices is None):
         parser.error("--poses and --slices belong together")
     predicts = held_out.check_options(parser, options)
-    logging.basicConfig(level=logging.WARNING, format="g3r-evaluate: %(message)s")
-    try:
+    logging.basicConfig(level=logging.WARNING, format=f"{PROG}: %(message)s")
+
+    def work() -> int:
         record = held_out.run(options) if predicts else _scored(options)
         if options.json:
             _write_json(Path(options.json), record)
-    except KeyboardInterrupt:
-        return _failed("interrupted; no scores were written", 130)
-    except ModuleNotFoundError as error:
-        return _failed(missing_extra(error), InputError.exit_code)
-    except EXPECTED as error:
-        return _failed(*line_and_code(error))
-    return 0
+        return 0
 
-
-def _failed(line: str, exit_code: int) -> int:
-    print(f"g3r-evaluate: {line}", file=sys.stderr)
-    return exit_code
+    return run_command(PROG, work, interrupted=lambda: ("interrupted; no scores were written", INTERRUPTED))
 
 
 def table(comparison: Comparison, pose_error: PoseError | None = None, lpips: float | None = None) -> str:

@@ -12,41 +12,42 @@ from typing import TYPE_CHECKING, Any
 
 from g3r._version import __version__
 from g3r.cli.completion import parsed
-from g3r.cli.failures import EXPECTED, is_out_of_memory, line_and_code
-from g3r.errors import G3RError, InputError
+from g3r.cli.failures import INTERRUPTED, is_out_of_memory, run_command
+from g3r.errors import G3RError, InputError, one_line
 
 if TYPE_CHECKING:
     from g3r.checkpoints.trained_model import TrainedModel
+
+PROG = "g3r-export"
 
 LESS_MEMORY = "end other programs, or use a machine with more"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code (0 done, 2 usage, 3 bad input, 4 out of memory, 130 interrupted)."""
-    parser = argparse.ArgumentParser(prog="g3r-export", description=__doc__)
+    parser = argparse.ArgumentParser(prog=PROG, description=__doc__)
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("run", metavar="RUN.ckpt", type=Path, help="checkpoint written by g3r-pretrain")
     parser.add_argument("file", metavar="FILE.safetensors", type=Path, help="file to write")
     parser.add_argument("--data-description", metavar="TEXT", help="training data in words, kept in the file")
     parser.add_argument("--force", action="store_true", help="replace FILE.safetensors if it exists")
     arguments = parsed(parser, argv)
-    try:
-        model = export(arguments.run, arguments.file, arguments.data_description, replace=arguments.force)
-    except KeyboardInterrupt:
-        return _failed("interrupted; no file was written", 130)
-    except EXPECTED as error:
-        return _failed(*line_and_code(error, LESS_MEMORY))
+    return run_command(
+        PROG,
+        lambda: _run(arguments),
+        interrupted=lambda: ("interrupted; no file was written", INTERRUPTED),
+        less_memory=LESS_MEMORY,
+    )
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    model = export(arguments.run, arguments.file, arguments.data_description, replace=arguments.force)
     size_mb = arguments.file.stat().st_size / 1e6
     print(f"{arguments.file}: {size_mb:.1f} MB, {model.in_words()}")
     print(f"trained on: {model.training_data}")
     for name, value in sorted(model.validation.items()):
         print(f"  {name:20s} {value:.4f}")
     return 0
-
-
-def _failed(line: str, exit_code: int) -> int:
-    print(f"g3r-export: {line}", file=sys.stderr)
-    return exit_code
 
 
 def export(run: Path, file: Path, data_description: str | None = None, *, replace: bool = False) -> TrainedModel:
@@ -87,8 +88,7 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
     except Exception as error:  # a network with unexpected values may raise anything
         if is_out_of_memory(error):
             raise
-        found = " ".join(str(error).split())[:120]
-        raise InputError(f"{run}: cannot be exported ({found}); export another checkpoint") from error
+        raise InputError(f"{run}: cannot be exported ({one_line(error)}); export another checkpoint") from error
 
 
 def _model_types() -> dict[str, type[TrainedModel]]:

@@ -1,8 +1,10 @@
-"""Failures of the machine (no memory, full disk) as one line and an exit code."""
+"""Failures of a command, by the user's input or by the machine, as one line and an exit code."""
 
 from __future__ import annotations
 
 import errno
+import sys
+from collections.abc import Callable
 
 from g3r.errors import G3RError, InputError, NumericalError, cannot_be_written
 
@@ -22,6 +24,39 @@ EXTRAS = {
 
 LESS_MEMORY = "choose a coarser --resolution or --preset preview, or crop the stacks"
 KERNEL_CACHE = "free space where the output, temporary files or compiled kernels are kept (NUMBA_CACHE_DIR)"
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as in shells."""
+
+
+def run_command(
+    prog: str, work: Callable[[], int], *, interrupted: Callable[[], tuple[str, int]], less_memory: str = LESS_MEMORY
+) -> int:
+    """Do the work of a command, and print the reason if it fails; returns the exit code.
+
+    Args:
+        prog: name of the command.
+        work: returns the exit code.
+        interrupted: the line for the user after an interruption, and the exit code.
+        less_memory: advice for lack of memory.
+
+    Raises:
+        BaseException: the error of the work, if it is a defect of the program.
+    """
+    try:
+        return work()
+    except KeyboardInterrupt:
+        return fail(prog, *interrupted())
+    except ModuleNotFoundError as error:
+        return fail(prog, missing_extra(error), InputError.exit_code)
+    except EXPECTED as error:
+        return fail(prog, *line_and_code(error, less_memory))
+
+
+def fail(prog: str, line: str, exit_code: int) -> int:
+    """Print why a command failed; returns the exit code."""
+    print(f"{prog}: {line}", file=sys.stderr)
+    return exit_code
 
 
 def line_and_code(error: BaseException, less_memory: str = LESS_MEMORY) -> tuple[str, int]:

@@ -19,13 +19,12 @@ from typing import TYPE_CHECKING
 
 from g3r._version import __version__
 from g3r.cli.dicom_options import stacks_on_disk, write_dicom
-from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
+from g3r.cli.failures import fail, run_command
 from g3r.cli.infer_options import parsed_options, told_options, without_names
 from g3r.cli.infer_task import STARTED_S, Task, check_files, earlier_run, prepared
 from g3r.cli.interruption import ended_behind, ended_in_order, nothing_written
 from g3r.cli.terminal import PROGRAM, Terminal
 from g3r.cli.time_left import TimeLeft, expected_seconds
-from g3r.errors import InputError
 from g3r.report.stage_words import WRITING
 from g3r.run.ahead import import_ahead
 from g3r.run.idle_threads import let_threads_sleep
@@ -52,15 +51,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     let_threads_sleep()
     atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
     stop_request = StopRequest()
-    try:
+
+    def work() -> int:
         with stop_request, _terminal(options, stop_request) as terminal:
             return _run(options, stop_request, terminal)
-    except KeyboardInterrupt:
-        return _failed(nothing_written(Path(options.output)), stop_request.exit_code)
-    except ModuleNotFoundError as error:
-        return _failed(missing_extra(error), InputError.exit_code)
-    except EXPECTED as error:
-        return _failed(*line_and_code(error))
+
+    return run_command(
+        PROGRAM, work, interrupted=lambda: (nothing_written(Path(options.output)), stop_request.exit_code)
+    )
 
 
 def _terminal(options: argparse.Namespace, stop_request: StopRequest) -> Terminal:
@@ -79,11 +77,6 @@ def _terminal(options: argparse.Namespace, stop_request: StopRequest) -> Termina
         compiling_s=compiling_s,
         stop_request=stop_request,
     )
-
-
-def _failed(line: str, exit_code: int) -> int:
-    print(f"{PROGRAM}: {line}", file=sys.stderr)
-    return exit_code
 
 
 def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Terminal) -> int:
@@ -113,13 +106,13 @@ def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Termi
         write_dicom(options, result, dicom)
         terminal.end_bar()
         stopped = stop_request.is_requested()
-        code = _failed(ended_in_order(result, folder), stop_request.exit_code) if stopped else 0
+        code = fail(PROGRAM, ended_in_order(result, folder), stop_request.exit_code) if stopped else 0
         _conclude(result, folder, terminal)
     except KeyboardInterrupt:  # a second signal, which raises at once
         if not output.is_written:
             raise
         terminal.end_bar()
-        return _failed(ended_behind(folder, options.dicom_out), stop_request.exit_code)
+        return fail(PROGRAM, ended_behind(folder, options.dicom_out), stop_request.exit_code)
     return code
 
 

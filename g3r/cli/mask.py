@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from g3r._version import __version__
 from g3r.cli.completion import parsed
-from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.failures import fail, run_command
 from g3r.cli.mask_options import add_masker_options, check_masker_options, check_threads, mask_weights_path, masker_of
 from g3r.errors import InputError
 from g3r.run.idle_threads import let_threads_sleep
@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     from g3r.checkpoints.weights_file import WeightsFile
     from g3r.masking.find import Masker
 
+PROG = "g3r-mask"
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = argparse.ArgumentParser(
-        prog="g3r-mask",
+        prog=PROG,
         description="Find the fetal brain in stacks of slices: a mask and a picture of each. Look at the pictures. "
         "For research only, not for diagnosis.",
         epilog="exit codes: 0 done, 2 usage, 3 a stack could not be read or shows no head (the others are done), "
@@ -51,15 +53,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_masker_options(parser, options)
     check_threads(parser, options)
     let_threads_sleep()
-    logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.WARNING, format=f"{PROG}: %(message)s", stream=sys.stderr)
     stop_request = StopRequest()
-    try:
+
+    def work() -> int:
         with stop_request, _silent("g3r.acquisition.slice_profile"):  # the slice thickness does not matter here
             return _run(options)
-    except KeyboardInterrupt:
-        return _said("interrupted; masks that were printed are whole", stop_request.exit_code)
-    except EXPECTED as error:
-        return _said(*line_and_code(error))
+
+    line = "interrupted; masks that were printed are whole"
+    return run_command(PROG, work, interrupted=lambda: (line, stop_request.exit_code))
 
 
 @contextmanager
@@ -91,7 +93,7 @@ def _run(options: argparse.Namespace) -> int:
         try:
             print(_mask(path, options.output / name, masker))
         except InputError as error:
-            exit_code = _said(str(error), error.exit_code)
+            exit_code = fail(PROG, str(error), error.exit_code)
     return exit_code
 
 
@@ -126,7 +128,7 @@ def _mask(path: str, target: Path, masker: Masker) -> str:
         raise InputError(f"{volume.name}: {found}; draw the mask by hand, or try --mask-command")
     stack = load_stack(path, found, float(volume.grid.spacing_mm.max()))
     save_mask_picture(target.with_name(f"{target.name}.png"), [stack])
-    volume_ml = found.volume_ml(volume)
+    volume_ml = volume.grid.volume_ml(found.inside)
     target.with_name(f"{target.name}.json").write_text(_record(path, found, volume_ml), encoding="utf-8")
     save_volume(target.with_name(f"{target.name}.nii.gz"), found.inside, volume.affine)
     return f"{target}.nii.gz: {volume_ml:.0f} ml, {found.source} ({found.detail})"
@@ -137,17 +139,12 @@ def _record(path: str, found: FoundMask, volume_ml: float) -> str:
     fields = {
         "Type": "Brain",
         "Sources": [Path(path).name],
-        "GeneratedBy": [{"Name": "g3r-mask", "Version": __version__}],
+        "GeneratedBy": [{"Name": PROG, "Version": __version__}],
         "MaskSource": found.source,
         "MaskDetail": found.detail,
         "VolumeMl": round(volume_ml, 1),
     }
     return json.dumps(fields, indent=2) + "\n"
-
-
-def _said(line: str, exit_code: int) -> int:
-    print(f"g3r-mask: {line}", file=sys.stderr)
-    return exit_code
 
 
 if __name__ == "__main__":

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from g3r._version import __version__
-from g3r.cli.failures import EXPECTED, is_out_of_memory, line_and_code, missing_extra
+from g3r.cli.failures import EXPECTED, INTERRUPTED, fail, is_out_of_memory, line_and_code, missing_extra
 from g3r.errors import G3RError, InputError
+
+PROG = "g3r-pretrain"
 
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
@@ -29,7 +31,7 @@ All options: g3r-pretrain fit --help      Watch: tensorboard --logdir runs
 Afterwards:  g3r-export runs/prior/version_0/checkpoints/last.ckpt prior.safetensors
 """
 
-INTERRUPTED = "interrupted; --ckpt_path FILE goes on from a checkpoint of the run"
+CUT_SHORT = "interrupted; --ckpt_path FILE goes on from a checkpoint of the run"
 LESS_MEMORY = "lower data.batch_size, or data.patch_size of the prior network"
 
 
@@ -41,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0 if arguments else 2
 
     if arguments[0] == "--version":
-        print(f"g3r-pretrain {__version__}")
+        print(f"{PROG} {__version__}")
         return 0
 
     try:
@@ -50,9 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         from g3r.training.annealed_module import AnnealedModule, WholeCheckpoints
     except KeyboardInterrupt:
-        return _failed(INTERRUPTED, 130)
+        return fail(PROG, CUT_SHORT, INTERRUPTED)
     except ModuleNotFoundError as error:
-        return _failed(missing_extra(error), InputError.exit_code)
+        return fail(PROG, missing_extra(error), InputError.exit_code)
 
     class PretrainCLI(LightningCLI):
         def instantiate_trainer(self, **options: Any) -> Trainer:
@@ -74,8 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if found is None:
             raise
         if isinstance(found, KeyboardInterrupt):
-            return _failed(INTERRUPTED, 130)
-        return _failed(*line_and_code(found, LESS_MEMORY))
+            return fail(PROG, CUT_SHORT, INTERRUPTED)
+        return fail(PROG, *line_and_code(found, LESS_MEMORY))
     return 0
 
 
@@ -84,11 +86,6 @@ def _first_known(error: BaseException | None) -> BaseException | None:
     while error is not None and not isinstance(error, (KeyboardInterrupt, G3RError)) and not is_out_of_memory(error):
         error = error.__cause__ or error.__context__
     return error
-
-
-def _failed(line: str, exit_code: int) -> int:
-    print(f"g3r-pretrain: {line}", file=sys.stderr)
-    return exit_code
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from g3r._version import __version__
-from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.failures import INTERRUPTED, run_command
 from g3r.errors import InputError
 
 IMAGE_ENDINGS = (".nii", ".nii.gz")
@@ -73,15 +73,9 @@ def told(prog: str, work: Callable[[], str]) -> int:
         work: returns the line to print.
     """
     logging.basicConfig(level=logging.WARNING, format=f"{prog}: %(message)s", stream=sys.stderr)
-    try:
+
+    def printed() -> int:
         print(work())
-    except KeyboardInterrupt:
-        return _failed(prog, "interrupted; nothing was written", 130)
-    except EXPECTED as error:
-        return _failed(prog, *line_and_code(error))
-    return 0
+        return 0
 
-
-def _failed(prog: str, line: str, exit_code: int) -> int:
-    print(f"{prog}: {line}", file=sys.stderr)
-    return exit_code
+    return run_command(prog, printed, interrupted=lambda: ("interrupted; nothing was written", INTERRUPTED))

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from g3r.cli.time_left import TimeLeft
 from g3r.report.stage_words import COMPILING, DOING, STARTING, STOPPING, WITHOUT_FACTS, line
+from g3r.report.verdict_messages import CHECK, DO_NOT_USE, USE
 from g3r.run.log_file import LogFile
 from g3r.run.reporter import Reporter
 from g3r.run.stop_request import StopRequest
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 PROGRAM = "g3r-infer"
 
 PLAIN, DETAIL, WARNING = "", "2", "33"
-COLOURS = {"use": "1;32", "check": "1;33", "do not use": "1;31"}
+COLOURS: dict[str, str] = {USE: "1;32", CHECK: "1;33", DO_NOT_USE: "1;31"}
 """Colour codes of terminals for kinds of lines, and for the words of the verdict."""
 
 MAX_COLUMNS = 100

@@ -6,6 +6,7 @@ import argparse
 import time
 from collections.abc import Callable, Mapping
 
+from g3r.cli.mask_options import AUTO
 from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, WRITING
 from g3r.run.kernel_cache import COMPILING_FIT_S
 
@@ -94,7 +95,7 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     n_to_find = 0
     if not (options.whole_image or options.mask_command or options.slices):
         given = options.masks or []
-        n_to_find = sum(one == "auto" for one in given) if given else max(len(options.stacks), 3)
+        n_to_find = sum(one == AUTO for one in given) if given else max(len(options.stacks), 3)
     before[FINDING_MASKS] += MASK_S * n_to_find
     if options.dry_run:
         return before

@@ -16,6 +16,7 @@ from g3r._version import __version__
 from g3r.dicom.headers import ImageHeader, quiet_pydicom
 from g3r.dicom.study import SourceStudy
 from g3r.errors import InputError
+from g3r.geometry.lps import LPS_FROM_RAS
 from g3r.run.output_folder import FOUND_ON_DISKS, OutputFolder
 
 if TYPE_CHECKING:
@@ -40,8 +41,6 @@ FIRST_NUMBER = 9001
 """Least number of the series, above the numbers that scanners use."""
 
 MAX_STORED = 2**16 - 1
-
-LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 BRIGHT_PERCENTILE = 99.9
 """Percentile of the positive values at which the window for viewers ends."""

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from g3r.acquisition.images import Volume
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry.lps import LPS_FROM_RAS, in_lps
 
 logger = logging.getLogger(__name__)
-
-LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0])
 
 START_ANGLES_DEG = (-25.0, 0.0, 25.0)
 """Start rotations about each axis; with the reach of the coarse level (about 20 degrees) they cover 45 degrees."""
@@ -117,10 +116,10 @@ def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | Non
     same = volume.data.shape == grid.shape and np.allclose(volume.affine, grid.affine, atol=1e-4)
     if volume_from_grid is None and same:
         return np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
-    pose = RigidPose.identity(1) if volume_from_grid is None else volume_from_grid
+    pose = in_lps(RigidPose.identity(1) if volume_from_grid is None else volume_from_grid)
     transform = sitk.AffineTransform(3)
-    transform.SetMatrix((LPS_FROM_RAS @ pose.rotation[0] @ LPS_FROM_RAS).ravel().tolist())
-    transform.SetTranslation((LPS_FROM_RAS @ pose.translation_mm[0]).tolist())
+    transform.SetMatrix(pose.rotation[0].ravel().tolist())
+    transform.SetTranslation(pose.translation_mm[0].tolist())
     target = _to_sitk(Volume(np.zeros(grid.shape, np.float32), grid.affine, "grid"))
     moved = sitk.Resample(_to_sitk(volume), target, transform, sitk.sitkBSpline, 0.0)
     return np.ascontiguousarray(sitk.GetArrayFromImage(moved).transpose(2, 1, 0))
@@ -197,18 +196,19 @@ def _pose(transform: sitk.Euler3DTransform) -> RigidPose:
     rotation = np.array(transform.GetMatrix()).reshape(3, 3)
     center = np.array(transform.GetCenter())
     shift = np.array(transform.GetTranslation()) + center - rotation @ center
-    return RigidPose((LPS_FROM_RAS @ rotation @ LPS_FROM_RAS)[None], (LPS_FROM_RAS @ shift)[None])
+    return in_lps(RigidPose(rotation[None], shift[None]))
 
 
 def _to_sitk(volume: Volume) -> sitk.Image:
     """The ITK image of a RAS volume; values that are not finite become 0, the value of missing data."""
     spacing = volume.grid.spacing_mm
-    direction = LPS_FROM_RAS @ volume.affine[:3, :3] / spacing
+    lps = LPS_FROM_RAS @ volume.affine
+    direction = lps[:3, :3] / spacing
     if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-3:
         raise InputError(f"{volume.name}: header is sheared (axes not orthogonal); resample it on an ordinary grid")
     data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0).astype(np.float32)
     image = sitk.GetImageFromArray(np.ascontiguousarray(data.transpose(2, 1, 0)))
     image.SetSpacing(spacing.tolist())
     image.SetDirection(direction.ravel().tolist())
-    image.SetOrigin((LPS_FROM_RAS @ volume.affine[:3, 3]).tolist())
+    image.SetOrigin(lps[:3, 3].tolist())
     return image

@@ -127,7 +127,7 @@ class TermOverlaps:
     work: Workspace
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TermLoss:
     """Value of an image term, and its gradients times the factor that it was added with.
 
@@ -252,7 +252,11 @@ class LossStep:
             residual,
         )
         return TermLoss(
-            term.mean(residual, state.slice_weight, chosen), chosen, residual, plane_gradient, field_gradient
+            mean=term.mean(residual, state.slice_weight, chosen),
+            chosen=chosen,
+            residual=residual,
+            plane_gradient=plane_gradient,
+            field_gradient=field_gradient,
         )
 
     def finish(self) -> float:

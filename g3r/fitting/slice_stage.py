@@ -93,6 +93,11 @@ class SliceFit:
     bias_field: list[list[float]]
     further: tuple[GaussianCloud, ...] = ()
 
+    @property
+    def n_rollbacks(self) -> int:
+        """Times that the divergence guard rolled back."""
+        return sum("rollback" in entry for entry in self.history)
+
 
 def fit_slices(
     cloud: GaussianCloud,

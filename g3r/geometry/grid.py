@@ -83,9 +83,7 @@ class VolumeGrid:
 
     def moved(self, pose: RigidPose) -> VolumeGrid:
         """The same voxels after a rigid motion of the world (one pose)."""
-        motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = pose.rotation[0], pose.translation_mm[0]
-        return VolumeGrid(self.shape, motion @ self.affine)
+        return VolumeGrid(self.shape, pose.matrix[0] @ self.affine)
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
@@ -96,6 +94,10 @@ class VolumeGrid:
     def voxel_volume_mm3(self) -> float:
         """Volume of a voxel."""
         return float(abs(np.linalg.det(self.affine[:3, :3])))
+
+    def volume_ml(self, mask: NDArray[np.bool_]) -> float:
+        """Volume of a mask [I, J, K] on the grid."""
+        return np.count_nonzero(mask) * self.voxel_volume_mm3 / 1000
 
     @property
     def center_mm(self) -> NDArray[np.float64]:

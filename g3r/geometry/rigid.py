@@ -57,6 +57,12 @@ class RigidPose:
         return cls(rotation_matrix(rotvec_rad), np.asarray(translation_mm, dtype=np.float64))
 
     @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> RigidPose:
+        """Motions from matrices [S, 4, 4] (RAS, mm), whose rotations are made exact: files have a few decimals."""
+        values = np.asarray(matrix, dtype=np.float64)
+        return cls(orthonormal(values[:, :3, :3]), values[:, :3, 3])
+
+    @classmethod
     def concatenated(cls, poses: Sequence[RigidPose]) -> RigidPose:
         """The motions of several records one after the other."""
         return cls(np.concatenate([p.rotation for p in poses]), np.concatenate([p.translation_mm for p in poses]))
@@ -72,6 +78,13 @@ class RigidPose:
         rotation = self.rotation @ other.rotation
         rotated = (self.rotation @ other.translation_mm[..., None])[..., 0]
         return RigidPose(orthonormal(rotation), rotated + self.translation_mm)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The motions as matrices [S, 4, 4]."""
+        found = np.tile(np.eye(4), (len(self), 1, 1))
+        found[:, :3, :3], found[:, :3, 3] = self.rotation, self.translation_mm
+        return found
 
     def inverse(self) -> RigidPose:
         """The motions that undo these."""

@@ -66,7 +66,7 @@ def find_masks(
             left_out.append(f"{volume.name}: left out, {found}")
             continue
         masks[n] = found
-        found_ml[n] = found.volume_ml(volume)
+        found_ml[n] = volume.grid.volume_ml(found.inside)
         logger.info("%s: mask: %s, %.0f ml (%s)", volume.name, found.source, found_ml[n], found.detail)
     for n in _odd_ones(masks, found_ml):
         left_out.append(

@@ -15,7 +15,7 @@ from g3r.fitting.lattice_mean import mean_cloud
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.maps import VolumeMaps, estimate_maps
 from g3r.output.mixture import FinishedVolume
-from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
+from g3r.output.record import LOSS_ROSE, RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
 from g3r.output.stage_results import StageResults
@@ -71,6 +71,9 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         run.notes.append(PARTIAL_NOTE if run.stopped_at else UNFITTED_NOTE)
     else:
         maps = estimate_maps(written, fit, found, settings, run, reliable=registration_reliable(qualities))
+    run.warnings += rollback_warnings(fit.n_rollbacks)
+    for warning in run.warnings:
+        logger.warning(warning)
     record = replace(
         _record(found, fit, qualities, plan, run, maps),
         unseen=unseen,
@@ -109,6 +112,14 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     )
 
 
+def rollback_warnings(n_rollbacks: int) -> list[str]:
+    """A line about the times that the fit to the slices went back to its best state; none if it never did."""
+    if not n_rollbacks:
+        return []
+    back = f"{n_rollbacks} times it went back to its best state and on with shorter steps"
+    return [f"{LOSS_ROSE}: {back}; look at the volume"]
+
+
 def _unseen_part(written: WrittenVolume, found: StageResults, settings: ReconstructionSettings) -> UnseenPart:
     """The unseen part of the brain, with the words for what is shown there."""
     return UnseenPart.of(
@@ -144,14 +155,6 @@ def _record(
     found: StageResults, fit: SliceFit, qualities: Sequence[StackQuality], plan: Plan, run: RunContext, maps: VolumeMaps
 ) -> RunRecord:
     settings, slices = plan.settings, found.prior.volumes.slices
-    n_rollbacks = sum("rollback" in entry for entry in fit.history)
-    if n_rollbacks:
-        run.warnings.append(
-            f"the loss of the fit rose: {n_rollbacks} times it went back to its best state and on "
-            "with shorter steps; look at the volume"
-        )
-    for warning in run.warnings:
-        logger.warning(warning)
     return RunRecord(
         settings=settings,
         time_budget=plan.record(),
@@ -166,7 +169,7 @@ def _record(
         pose_rounds=found.rounds,
         held_out=found.held_out,
         gaussian_spacing_mm=found.cloud.spacing_mm if found.cloud else None,
-        n_rollbacks=n_rollbacks,
+        n_rollbacks=fit.n_rollbacks,
         inactive_terms=inactive_terms(slices, adapted(settings, slices.n_stacks)),
         loss={Stage.FIT_TO_PRIOR: found.cloud.history if found.cloud else [], Stage.FIT_TO_SLICES: list(fit.history)},
         uncertainty=maps.record,

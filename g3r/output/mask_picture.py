@@ -75,9 +75,7 @@ def _draw_stack(panels: list[Axes], stack: Stack) -> None:
         panel.text(0.03, 0.03, str(number), color=FAINT_INK, fontsize=7, transform=panel.transAxes)
     for panel in panels:
         panel.axis("off")
-    title = (
-        f"{stack.name}: brain by {stack.mask_source}, {stack.mask.sum() * stack.grid.voxel_volume_mm3 / 1000:.0f} ml"
-    )
+    title = f"{stack.name}: brain by {stack.mask_source}, {stack.grid.volume_ml(stack.mask):.0f} ml"
     panels[0].set_title(title, color=INK, fontsize=8, loc="left", pad=3)
 
 

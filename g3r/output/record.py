@@ -36,6 +36,9 @@ from g3r.uncertainty.unseen import UnseenPart
 
 MAX_RECORD_BYTES = 50_000_000
 
+LOSS_ROSE = "the loss of the fit rose"
+"""Start of the warning about rollbacks; the verdict has a message of its own for them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationRecord:

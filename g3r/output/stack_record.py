@@ -79,9 +79,8 @@ class StackRecord:
 
 def mean_motion(slices: Slices) -> list[list[float]]:
     """Robust mean of the rigid motions [4, 4] (RAS, mm) that take points from where headers put them to the poses."""
-    matrix, motion = np.eye(4), motion_to_headers(slices).inverse()
-    matrix[:3, :3], matrix[:3, 3] = motion.rotation[0], motion.translation_mm[0]
-    return [[round(float(x), 9) for x in row] for row in matrix]
+    motion = motion_to_headers(slices).inverse()
+    return [[round(float(x), 9) for x in row] for row in motion.matrix[0]]
 
 
 def stack_records(
@@ -112,7 +111,7 @@ def stack_records(
             spacing_mm=[round(float(x), 6) for x in stack.spacing_mm],
             mask_from=stack.mask_source,
             mask_detail=stack.mask_detail,
-            mask_ml=round(float(stack.mask.sum()) * stack.grid.voxel_volume_mm3 / 1000, 1),
+            mask_ml=round(stack.grid.volume_ml(stack.mask), 1),
             left_out_share=round(left_out_share(stack), 3),
             remarks=list(stack.remarks),
             n_slices=int((stack_id == n).sum()),

@@ -112,8 +112,7 @@ def _(found: SliceFit) -> Iterator[Told]:
 
 @told_of.register
 def _(found: FinishedVolume) -> Iterator[Told]:
-    volume_ml = float(found.mask.sum()) * found.grid.voxel_volume_mm3 / 1000
-    facts = {"voxel": f"{found.grid.spacing_mm[0]:g}", "volume": f"{volume_ml:.0f}"}
+    facts = {"voxel": f"{found.grid.spacing_mm[0]:g}", "volume": f"{found.grid.volume_ml(found.mask):.0f}"}
     if found.unseen.share < MENTIONED_ABOVE:
         yield "volume", facts
     else:

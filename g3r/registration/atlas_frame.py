@@ -31,7 +31,7 @@ RIVAL_DEG = 30.0
 """An orientation at least this far from the chosen one counts as another one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Orientation:
     """Poses of all slices in the atlas frame (RAS, the mid-sagittal plane at x = 0), and how well they fit.
 
@@ -94,7 +94,7 @@ def standard_orientation(
     if best.correlation < MIN_ATLAS_CORRELATION:
         return None
     pose = best.motion @ slices.planes.pose
-    return Orientation(pose, best.correlation, weeks, best.template.scale, rival)
+    return Orientation(pose=pose, correlation=best.correlation, weeks=weeks, scale=best.template.scale, rival=rival)
 
 
 def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> Orientation:
@@ -107,7 +107,7 @@ def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> 
     pixels, still = SearchPixels.of(slices), RigidPose.identity(1)
     found = [(float(correlation(pixels.moments(one.volume, one.grid, still).sum(1))[0]), one) for one in templates]
     best, template = max(found, key=lambda one: one[0])
-    return Orientation(slices.planes.pose, best, template.weeks, template.scale)
+    return Orientation(pose=slices.planes.pose, correlation=best, weeks=template.weeks, scale=template.scale)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from g3r.run.deadline import Deadline
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchResult:
     """Result of the search.
 
@@ -87,7 +87,7 @@ class GlobalSearch:
                 best = found
             lowest = min(_score(best).correlations)
             finished = lowest >= RETRY_BELOW_CORRELATION or not self.settings.segments
-            if finished or (deadline is not None and deadline.has_passed()):
+            if finished or (deadline is not None and deadline.record_whether_passed()):
                 break
             logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
         assert best is not None
@@ -121,7 +121,9 @@ class GlobalSearch:
             if after.cost <= score.cost - needed:
                 motion, score = segmented, after
         correlations = {key: value.correlations for key, value in scores.items()}
-        return SearchResult(motion, name, correlations, placed, fill, score)
+        return SearchResult(
+            motion=motion, initialisation=name, initialisations=correlations, placed=placed, fill=fill, score=score
+        )
 
 
 def _score(found: SearchResult) -> HeldOutScore:
@@ -142,10 +144,10 @@ def search_single(
     """
     motion = RigidPose.identity(len(slices))
     if template is None:
-        return SearchResult(motion, "headers", {}, None)
+        return SearchResult(motion=motion, initialisation="headers", initialisations={}, placed=None)
     placed = place_in_atlas(slices, [sample], template, np.random.default_rng([settings.seed, 0]))
     if not settings.segments:
-        return SearchResult(motion, "headers", {}, placed)
+        return SearchResult(motion=motion, initialisation="headers", initialisations={}, placed=placed)
     (placement,), head = placed.placement, placed.template
     segments = placement.motion
     if sample.profile.has_missing:
@@ -160,4 +162,5 @@ def search_single(
         min_cost_gain=max(MIN_SINGLE_GAIN, MIN_SINGLE_GAIN_PER_SAMPLE * sample.pixels.n_samples),
         min_correlation=MIN_SINGLE_CORRELATION,
     )
-    return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)
+    initialisation = "headers" if is_rigid else "template"
+    return SearchResult(motion=motion, initialisation=initialisation, initialisations={}, placed=placed)

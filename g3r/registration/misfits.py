@@ -74,7 +74,7 @@ def register_robustly(
         believed += [(out, others)] if _fits(others) else []
     elif most_failed(qualities):
         for number in numbers:
-            if deadline is not None and deadline.part(1.0, reserve_s=took_s).has_passed():
+            if deadline is not None and deadline.part(1.0, reserve_s=took_s).record_whether_passed():
                 return found
             logger.info("most stacks do not fit: registration without stack %d", number)
             others = without([number])

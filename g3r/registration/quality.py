@@ -19,7 +19,16 @@ PARALLEL = "all stacks: their slices are nearly parallel in the head"
 """Start of the warning about nearly parallel stacks."""
 
 LEFT_OUT = "left out of the volume"
-"""How the line about a stack that was left out goes on after its name."""
+NO_SLICE = "no slice with enough masked pixels"
+PERHAPS_MIRRORED = "may be a mirror image of"
+PROBABLY_MIRRORED = "probably a mirror image of"
+FAILED = "registration probably failed"
+
+JUDGED = (LEFT_OUT, NO_SLICE, PERHAPS_MIRRORED, PROBABLY_MIRRORED, FAILED)
+"""Starts, after the stack's name, of warnings about a quality that the verdict has a message of its own for."""
+
+WITHOUT_SLICES = StackQuality(reliable=False, held_out_correlation=None, median_slice_ncc=None, downweighted_share=0.0)
+"""Quality of a stack without slices."""
 
 
 def unknown_orientation_note(slices: Slices) -> str:
@@ -37,7 +46,7 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
     for n in range(n_stacks):
         of_stack = registration.slices.stack_id == n
         if n not in present:
-            found.append(left_out.get(n, StackQuality(False, None, None, 0.0)))
+            found.append(left_out.get(n, WITHOUT_SLICES))
             continue
         place = present.index(n)
         held_out = None if registration.held_out is None else registration.held_out[place]
@@ -87,23 +96,23 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
     lines = []
     for stack, one in zip(stacks, qualities, strict=True):
         if one.median_slice_ncc is None:
-            lines.append(f"{stack.name}: no slice with enough masked pixels; the stack was not used")
+            lines.append(f"{stack.name}: {NO_SLICE}; the stack was not used")
         elif one.left_out:
             # a stack that merely does not fit does no harm once it is left out: `left_out_notes`
             lines += [f"{stack.name}: {LEFT_OUT}, {misfit(one)}"] if is_mirrored(one) else []
         elif is_mirrored(one) and one.reliable:
             lines.append(
-                f"{stack.name}: may be a mirror image of what the other stack shows (handedness "
+                f"{stack.name}: {PERHAPS_MIRRORED} what the other stack shows (handedness "
                 f"{rounded_down(one.handedness)}); compare both where the head is not symmetric"
             )
         elif is_mirrored(one) and not shortfalls(one):
             lines.append(
-                f"{stack.name}: probably a mirror image of what the other stacks show (handedness "
+                f"{stack.name}: {PROBABLY_MIRRORED} what the other stacks show (handedness "
                 f"{rounded_down(one.handedness)}); do not rely on the volume"
             )
         elif one.reliable is False:
             lines.append(
-                f"{stack.name}: registration probably failed (correlation with the other stacks "
+                f"{stack.name}: {FAILED} (correlation with the other stacks "
                 f"{one.held_out_correlation:.2f}, of its slices with the volume {one.median_slice_ncc:.2f}, "
                 f"{one.downweighted_share:.0%} of its slices fit badly{_overlap_text(one)}); do not rely on the volume"
             )

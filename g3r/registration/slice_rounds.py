@@ -94,7 +94,7 @@ def refine_slices(
         rounds.run(round(min(1.0, done * settings.n_rounds / max(1, settings.n_rounds - 1)), 9))
     rng = np.random.default_rng(settings.seed)
     for _ in range(settings.stray_searches if settings.n_rounds else 0):
-        if deadline is not None and deadline.has_passed():
+        if deadline is not None and deadline.record_whether_passed():
             break
         rounds.slices, n_found = find_strays(rounds.slices, rounds.gain, rounds.weight, rounds.ncc, rng)
         if not n_found:

@@ -22,7 +22,7 @@ from g3r.registration.thresholds import (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StackQuality:
     """Quality of the registration of one stack.
 

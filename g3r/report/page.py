@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 from markupsafe import Markup
 
 from g3r.acquisition.images import load_volume
@@ -21,7 +20,7 @@ from g3r.output.map_colours import INFERNO
 from g3r.output.record import RunRecord
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MIN_HELD_OUT, RETRY_BELOW_CORRELATION
 from g3r.report.motion_chart import motion_chart
-from g3r.report.pictures import grey
+from g3r.report.pictures import central_sections
 from g3r.report.slice_pictures import MAX_SHOWN, SlicePicture, slice_pictures, worst_first
 from g3r.report.slice_rows import SliceRows
 from g3r.report.stack_rows import scale_ends, stack_rows
@@ -79,7 +78,9 @@ def report_html(folder: Path, slices: Slices | None = None) -> str:
         scale=scale_ends(),
         good=RETRY_BELOW_CORRELATION,
         bad=MIN_HELD_OUT,
-        sections=_sections(images),
+        sections=central_sections(
+            images.data["volume"], images.grid.index(images.mask_center_mm), *images.window["volume"]
+        ),
         unseen=_unseen_line(record),
         charts=_charts(record, rows, images),
         pictures=pictures,
@@ -124,14 +125,6 @@ def _json(value: Any) -> str:
 def _colors() -> str:
     """The colour map, 256 colours of three bytes each, as base64."""
     return base64.b64encode(INFERNO.tobytes()).decode("ascii")
-
-
-def _sections(images: ViewerImages) -> list[tuple[str, str]]:
-    """Central sections of the volume for print and without scripts; the patient's right is on the left."""
-    volume, (low, high) = images.data["volume"], images.window["volume"]
-    i, j, k = np.rint(images.grid.index(images.mask_center_mm)).astype(int).tolist()
-    found = (("axial", volume[::-1, :, k]), ("coronal", volume[::-1, j, :]), ("sagittal", volume[i, ::-1, :]))
-    return [(name, grey(section.T, low, high)) for name, section in found]
 
 
 def _pictures(folder: Path, record: RunRecord, rows: SliceRows, slices: Slices | None) -> list[SlicePicture]:

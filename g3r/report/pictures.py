@@ -21,6 +21,22 @@ def grey(section: NDArray[np.float32], low: float, high: float) -> str:
     return _png(_bytes((section - low) / (high - low)))
 
 
+def central_sections(
+    volume: NDArray[np.float32], index: NDArray[np.float64], low: float, high: float
+) -> tuple[tuple[str, str], ...]:
+    """Name and picture of the axial, the coronal and the sagittal section; the patient's right is on the left.
+
+    Args:
+        volume: [I, J, K], axes along RAS.
+        index: [3] of the voxel through which the sections go, rounded.
+        low: intensity shown as black.
+        high: intensity shown as white.
+    """
+    i, j, k = np.rint(index).astype(int).tolist()
+    found = (("axial", volume[::-1, :, k]), ("coronal", volume[::-1, j, :]), ("sagittal", volume[i, ::-1, :]))
+    return tuple((name, grey(section.T, low, high)) for name, section in found)
+
+
 def difference(section: NDArray[np.float32], high: float) -> str:
     """Signed errors [up, across]: brighter than predicted in orange, darker in blue, none in black.
 

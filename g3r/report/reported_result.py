@@ -15,7 +15,7 @@ from markupsafe import escape
 
 from g3r.errors import InputError
 from g3r.output.result import ReconstructionResult
-from g3r.report.pictures import grey
+from g3r.report.pictures import central_sections
 from g3r.report.verdict import Verdict, verdict_of
 from g3r.run.output_folder import OutputFolder
 
@@ -135,10 +135,8 @@ class ReportedResult(ReconstructionResult):
             write_report(saved, self.slices, path)
 
     def _sections(self) -> tuple[tuple[str, str], ...]:
-        """Central sections; the patient's right is on the left, as in the page."""
+        """Central sections, as in the page."""
         if not self.mask.any():
             return ()
         high = float(np.percentile(self.volume[self.mask], BRIGHT_PERCENTILE)) or 1.0
-        i, j, k = np.rint(np.argwhere(self.mask).mean(0)).astype(int).tolist()
-        found = {"axial": self.volume[::-1, :, k], "coronal": self.volume[::-1, j, :], "sagittal": self.volume[i, ::-1]}
-        return tuple((name, grey(section.T, 0.0, high)) for name, section in found.items())
+        return central_sections(self.volume, np.argwhere(self.mask).mean(0), 0.0, high)

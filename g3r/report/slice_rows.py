@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.interleave import pass_and_place
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import orthonormal
 from g3r.output.files import SLICE_COLUMNS
 from g3r.output.record import RunRecord
 
@@ -81,8 +81,9 @@ class SliceRows:
 
     def acquisition_key(self, record: RunRecord) -> NDArray[np.int64]:
         """Order [K] of the slices in time, stack after stack, by the interleave found in registration."""
-        step = np.array([stack.interleave or 1 for stack in record.stacks])[self.stack]
-        return np.lexsort((self.number // step, self.number % step, self.stack))
+        interleave = np.array([stack.interleave or 1 for stack in record.stacks])[self.stack]
+        its_pass, place = pass_and_place(self.number, interleave)
+        return np.lexsort((place, its_pass, self.stack))
 
     def head_motion(self, record: RunRecord, center_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Motion of the head in each slice relative to its mean pose, along the axes of the scanner (RAS).
@@ -96,8 +97,7 @@ class SliceRows:
         """
         mean = RigidPose.identity(1)
         if record.registration and record.registration.standard_from_scanner is not None:
-            matrix = np.array(record.registration.standard_from_scanner, dtype=np.float64)
-            mean = RigidPose(orthonormal(matrix[None, :3, :3]), matrix[None, :3, 3])
+            mean = RigidPose.from_matrix([record.registration.standard_from_scanner])
         # the motion of the head is the inverse of the motion of the slice
         head = self.motion.inverse() @ mean
         center = mean.inverse().apply(center_mm[None])[0]

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from g3r.output.record import LOSS_ROSE
 from g3r.planning.anatomy import NAME_OF
-from g3r.registration.quality import LEFT_OUT, PARALLEL, misfit, nearly_parallel
+from g3r.registration.quality import JUDGED, PARALLEL, misfit, nearly_parallel
 from g3r.registration.stack_quality import is_mirrored, rounded_down, shortfalls, unlike_others
 from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 from g3r.report.verdict_messages import HEADLINES, MESSAGES, MILDEST_FIRST, USE, Word
@@ -165,15 +166,8 @@ def _listed(names: list[str]) -> str:
 
 def _is_said_otherwise(line: str, record: RunRecord) -> bool:
     """Whether a warning of the run has its own message in the table."""
-    if line.startswith("the loss of the fit rose: "):
+    if line.startswith(LOSS_ROSE):
         return record.n_rollbacks > 0
     if line.startswith(PARALLEL):
         return True
-    ends = (
-        LEFT_OUT,
-        "registration probably failed",
-        "probably a mirror image of",
-        "may be a mirror image of",
-        "no slice with enough masked pixels",
-    )
-    return any(line.startswith(f"{stack.name}: {end}") for stack in record.stacks for end in ends)
+    return any(line.startswith(f"{stack.name}: {start}") for stack in record.stacks for start in JUDGED)

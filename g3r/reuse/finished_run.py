@@ -13,7 +13,6 @@ from g3r.acquisition.images import Space, Volume, load_volume
 from g3r.errors import InputError
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.geometry.rigid import orthonormal
 from g3r.output.files import REUSE_NAME
 from g3r.output.mixture import Mixture
 from g3r.output.record import RegistrationRecord, RunRecord
@@ -69,10 +68,8 @@ class FinishedRun:
     @property
     def standard_from_scanner(self) -> RigidPose | None:
         """The rigid motion of points (RAS, mm) from the scanner to the volume; None if that is in scanner space."""
-        if self.registration.standard_from_scanner is None:
-            return None
-        matrix = np.array(self.registration.standard_from_scanner, dtype=np.float64)
-        return RigidPose(orthonormal(matrix[None, :3, :3]), matrix[None, :3, 3])  # run.json has nine decimals
+        matrix = self.registration.standard_from_scanner
+        return None if matrix is None else RigidPose.from_matrix([matrix])
 
     @property
     def stack_names(self) -> list[str]:

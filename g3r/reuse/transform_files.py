@@ -9,13 +9,10 @@ import struct
 import warnings
 from pathlib import Path
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from g3r.geometry import RigidPose
-
-LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0])
-"""ITK's world has its first two axes reversed."""
+from g3r.geometry.lps import in_lps
 
 DOF_MAGIC, DOF_RIGID, N_RIGID = 815007, 2, 6
 """First words of a .dof, the type of a rigid transformation, and the number of its parameters."""
@@ -35,9 +32,9 @@ def write_itk(path: Path, pose: RigidPose) -> None:
     """
     import SimpleITK
 
-    transform = SimpleITK.AffineTransform(3)
-    transform.SetMatrix((LPS_FROM_RAS @ pose.rotation[0] @ LPS_FROM_RAS).ravel().tolist())
-    transform.SetTranslation((LPS_FROM_RAS @ pose.translation_mm[0]).tolist())
+    lps, transform = in_lps(pose), SimpleITK.AffineTransform(3)
+    transform.SetMatrix(lps.rotation[0].ravel().tolist())
+    transform.SetTranslation(lps.translation_mm[0].tolist())
     SimpleITK.WriteTransform(transform, str(path))
 
 

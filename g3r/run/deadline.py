@@ -64,8 +64,8 @@ class Deadline:
         """The deadline of a stage that may take a share of the time left after a reserve."""
         return replace(self, end_s=self.clock() + share * max(0.0, self.remaining_s - reserve_s))
 
-    def has_passed(self) -> bool:
-        """Whether no time is left: by the clock, or as recorded if loops are replayed."""
+    def record_whether_passed(self) -> bool:
+        """Whether no time is left by the clock, kept in the loop record; as kept there if loops are replayed."""
         if self.loop_record is None:
             return self.remaining_s <= 0
         known = self.loop_record.begin()

@@ -19,9 +19,10 @@ from g3r.bench.record import machine_line
 from g3r.bids.dataset import Session
 from g3r.bids.derivative import SECTIONS, THUMBNAIL, figure_path
 from g3r.bids.index_page import PAGE, write_index
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, USE, Outcome
+from g3r.bids.outcome import FAILED, Outcome
 from g3r.bids.table import TABLE, write_table
 from g3r.errors import InputError
+from g3r.report.verdict_messages import CHECK, DO_NOT_USE, USE
 from studies.harness import Record, Row, Study, Task, positive
 from studies.tables import table
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
 from g3r.acquisition.foreground import Foreground, foreground
@@ -22,6 +23,12 @@ from tests.acquisition.ellipsoids import (
     volume_of,
     without,
 )
+
+
+def beside_nothing(brain: NDArray[np.bool_], unseen: NDArray[np.bool_]) -> Foreground:
+    """Voxels that are wholly brain or not, and none that is hardly seen."""
+    share, thin = brain.astype(np.float32), np.zeros_like(brain)
+    return Foreground(brain=brain, core=brain, share=share, unseen=unseen, thin=thin)
 
 
 @pytest.mark.parametrize("n_stacks", [1, 2, 3])
@@ -88,7 +95,7 @@ def test_the_hull_reaches_the_borders_of_the_grid() -> None:
     unseen = np.zeros_like(brain)
     unseen[4:7], unseen[11] = True, True
     seen = brain | (np.arange(12) == 3)[:, None, None] | (np.arange(12) == 7)[:, None, None]
-    mask = Foreground(seen, seen, seen.astype(np.float32), unseen, np.zeros_like(seen)).support()
+    mask = beside_nothing(seen, unseen).support()
     assert mask[1:11].all()
     assert not mask[[0, 11]].any()
 
@@ -96,7 +103,7 @@ def test_the_hull_reaches_the_borders_of_the_grid() -> None:
 def test_a_flat_or_lone_brain_has_no_hull() -> None:
     brain, unseen = np.zeros((6, 6, 6), bool), np.ones((6, 6, 6), bool)
     brain[3, 1:5, 1:5], unseen[3] = True, False
-    found = Foreground(brain, brain, brain.astype(np.float32), unseen, np.zeros_like(brain))
+    found = beside_nothing(brain, unseen)
     np.testing.assert_array_equal(found.support(), brain)
 
 
@@ -120,7 +127,7 @@ def test_what_is_merely_possible_is_shown_beside_the_mask_alone() -> None:
     """Possible voxels form a slab at the border of the grid that touches the brain, as from an unsure network."""
     seen, possible = np.zeros((30, 9, 9), bool), np.zeros((30, 9, 9), bool)
     seen[2:9], possible[9:27] = True, True
-    found = Foreground(seen, seen, seen.astype(np.float32), ~seen, np.zeros_like(seen), possible_voxels=4)
+    found = replace(beside_nothing(seen, ~seen), possible_voxels=4)
     np.testing.assert_array_equal(found.mask(0.4 * possible), seen)
     shown = found.support(0.4 * possible)
     assert shown[2:13].all()

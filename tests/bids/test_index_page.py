@@ -8,7 +8,8 @@ from pathlib import Path
 from g3r.bids.dataset import Session
 from g3r.bids.derivative import REPORT, SECTIONS, THUMBNAIL, figure_path
 from g3r.bids.index_page import write_index
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, USE, Outcome, log_path
+from g3r.bids.outcome import FAILED, NOT_RUN, Outcome, log_path
+from g3r.report.verdict_messages import CHECK, DO_NOT_USE, USE
 
 
 def test_the_worst_come_first_and_text_is_escaped(tmp_path: Path) -> None:

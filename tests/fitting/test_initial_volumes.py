@@ -109,7 +109,7 @@ def test_a_template_is_placed_only_in_the_atlas_frame() -> None:
     assert placed_template(prior, None) is None
     assert placed_template(None, None) is None
     slices = slices_of_a_ball()
-    orientation = Orientation(slices.planes.pose, 0.9, 30.0, 1.1)
+    orientation = Orientation(pose=slices.planes.pose, correlation=0.9, weeks=30.0, scale=1.1)
     placed = placed_template(prior, orientation)
     assert placed is not None
     np.testing.assert_array_equal(placed.volume, prior.template.volume[1])

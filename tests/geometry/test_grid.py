@@ -78,6 +78,12 @@ def test_small_voxels_are_not_taken_for_singular() -> None:
     assert VolumeGrid((3, 3, 3), np.diag([1e-4, 1e-4, 1e-4, 1])).voxel_volume_mm3 == pytest.approx(1e-12)
 
 
+def test_a_mask_has_the_volume_of_its_voxels() -> None:
+    mask = np.zeros((3, 4, 5), bool)
+    mask[0, :2, 1:4] = True
+    assert VolumeGrid(mask.shape, np.diag([-10.0, 5.0, 2.0, 1.0])).volume_ml(mask) == pytest.approx(0.6)
+
+
 def test_a_moved_grid_has_its_voxels_where_the_motion_puts_them() -> None:
     grid = VolumeGrid((3, 4, 5), affine_of(AXES["LAS"], (0.8, 1.0, 2.0), (4.0, -3.0, 2.0)))
     motion = RigidPose.from_rotvec([[0.3, -0.2, 0.1]], [[5.0, 6.0, -7.0]])

@@ -37,6 +37,20 @@ def test_inverse_undoes() -> None:
         np.testing.assert_allclose(round_trip.translation_mm, 0, atol=1e-12)
 
 
+def test_matrices_move_the_same_points_and_come_back_from_a_file() -> None:
+    pose = poses(8, 4)
+    points = np.random.default_rng(9).normal(0, 100, (4, 3))
+    homogeneous = np.column_stack([points, np.ones(4)])
+    np.testing.assert_allclose(
+        np.einsum("sij,sj->si", pose.matrix, homogeneous)[:, :3], pose.apply(points[:, None])[:, 0], atol=1e-11
+    )
+    read = RigidPose.from_matrix(pose.matrix.round(9).tolist())  # as run.json has them
+    np.testing.assert_allclose(read.matrix, pose.matrix, atol=1e-9)
+    np.testing.assert_allclose(
+        read.rotation @ read.rotation.transpose(0, 2, 1), RigidPose.identity(4).rotation, atol=1e-14
+    )
+
+
 def test_rotations_stay_orthonormal_over_many_compositions() -> None:
     step = poses(7, 1)
     pose = RigidPose.identity(1)

@@ -199,6 +199,6 @@ def step_size_rows() -> list[dict[str, float]]:
             else:
                 image = [entry["image"] for entry in fit.history]
                 row |= {"first": image[0], "most": max(image), "residual": image[-1]}  # with gains and fields
-                row["back"] = sum("rollback" in entry for entry in fit.history)
+                row["back"] = fit.n_rollbacks
             rows.append(row)
     return rows

@@ -137,7 +137,7 @@ def test_steps_that_are_too_large_are_taken_back(factor: float, tally: Tally, ca
     def residual(result: SliceFit) -> float:
         return result.history[-1]["image"]  # includes gains, whose steps were too large as well
 
-    assert any("rollback" in entry for entry in rash.history)
+    assert rash.n_rollbacks > 0
     assert "back to the best state" in caplog.text
     assert residual(rash) < rash.history[0]["image"]
     assert residual(rash) < 1.5 * residual(plain)

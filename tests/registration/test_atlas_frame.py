@@ -74,4 +74,5 @@ def test_a_template_that_looks_alike_the_other_way_round_makes_the_orientation_d
 @pytest.mark.parametrize(("rival", "doubtful"), [(None, False), (0.60, False), (0.69, True), (0.7, True)])
 def test_doubt_is_a_matter_of_the_margin(rival: float | None, doubtful: bool) -> None:
     pose = RigidPose(Rotation.identity(1).as_matrix(), np.zeros((1, 3)))
-    assert Orientation(pose, 0.7, 28.0, 1.0, rival).is_doubtful is doubtful
+    found = Orientation(pose=pose, correlation=0.7, weeks=28.0, scale=1.0, rival=rival)
+    assert found.is_doubtful is doubtful

@@ -12,9 +12,10 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.planes import Slices
 from g3r.registration.intruder import misfit_without_each
 from g3r.registration.slice_rounds import FittedSlices, correlation_with_all
-from g3r.registration.stack_quality import StackQuality, shortfalls
+from g3r.registration.stack_quality import shortfalls
 from g3r.registration.thresholds import IN_PLACE_NCC, MIN_MISFIT_WITHOUT
 from tests.registration.moving_heads import STILL, as_slices, simulated
+from tests.report.records import quality
 
 VOXEL_MM, MAX_PIXELS = 1.8, 100_000
 
@@ -55,7 +56,7 @@ def test_stacks_in_place_and_those_that_have_no_two_others_are_not_asked(still: 
 
 
 def test_the_reason_says_how_much_better_the_others_fit() -> None:
-    good = StackQuality(True, 0.8, 0.88, 0.0, misfit_without=MIN_MISFIT_WITHOUT)
+    good = quality(True, 0.8, 0.88, misfit_without=MIN_MISFIT_WITHOUT)
     assert shortfalls(good) == []
     (line,) = shortfalls(replace(good, misfit_without=0.45))
     assert line == "the other stacks fit each other 55% better without it; good is 40% or less"

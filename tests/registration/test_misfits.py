@@ -21,9 +21,10 @@ from g3r.run.deadline import Deadline
 from g3r.run.stage_file import as_stored
 from tests.registration.moving_heads import Moving, as_slices
 from tests.registration.test_quality import QUICK, noise_instead
+from tests.report.records import quality
 
-GOOD, FAILED = StackQuality(True, 0.8, 0.95, 0.0), StackQuality(False, 0.3, 0.8, 0.0)
-UNLIKE = StackQuality(True, 0.8, 0.85, 0.0)
+GOOD, FAILED = quality(True, 0.8, 0.95), quality(False, 0.3, 0.8)
+UNLIKE = quality(True, 0.8, 0.85)
 MIRRORED = replace(GOOD, handedness=-0.1)  # possible for one of two stacks
 
 
@@ -39,10 +40,10 @@ def same(a: Registration, b: Registration) -> bool:
 def test_a_stack_of_noise_is_left_out_wherever_it_stands(still: list[SimulatedStack], place: int) -> None:
     slices, _ = as_slices(with_noise(still, place))
     found = register_robustly(slices, QUICK)
-    ((number, quality),) = found.left_out
+    ((number, left_out),) = found.left_out
     assert number == place
-    assert quality.left_out
-    assert quality.reliable is False
+    assert left_out.left_out
+    assert left_out.reliable is False
     others = slices.stack_id != place
     assert set(found.slices.stack_id) == {0, 1, 2} - {place}
     assert same(found, register(slices.take(others), QUICK))

@@ -30,6 +30,7 @@ from g3r.registration.thresholds import (
     MIRRORED_BELOW,
 )
 from tests.registration.moving_heads import STILL, Moving, as_slices, simulated
+from tests.report.records import quality
 
 QUICK = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=2, finest_voxel_mm=1.8)
 
@@ -47,9 +48,9 @@ def noise_instead(one: SimulatedStack) -> SimulatedStack:
     return replace(one, stack=replace(one.stack, image=image))
 
 
-def held_out(quality: StackQuality) -> float:
-    assert quality.held_out_correlation is not None
-    return quality.held_out_correlation
+def held_out(one: StackQuality) -> float:
+    assert one.held_out_correlation is not None
+    return one.held_out_correlation
 
 
 def test_stacks_that_are_registered_are_reliable(still: list[SimulatedStack], moving: Moving) -> None:
@@ -190,7 +191,7 @@ def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[Simulated
 
 def test_a_stack_that_was_left_out_does_not_make_the_others_unreliable(still: list[SimulatedStack]) -> None:
     estimate = estimate_with([0.7, 0.9], [0.95] * 4, [1.0] * 4, [0, 0, 2, 2])
-    estimate.left_out = [(1, StackQuality(False, 0.31, 0.8, 0.0, left_out=True))]
+    estimate.left_out = [(1, quality(False, 0.31, 0.8, left_out=True))]
     found = stack_qualities(estimate, 3)
     assert registration_reliable(found)
     assert registration_summary(found).startswith(

@@ -15,8 +15,12 @@ from g3r.registration.stack_quality import StackQuality
 from g3r.uncertainty.unseen import UnseenPart
 
 
-def quality(reliable: bool | None = True, held_out: float | None = 0.84) -> StackQuality:
-    return StackQuality(reliable, held_out, 0.95, 0.1)
+def quality(
+    reliable: bool | None = True, held_out: float | None = 0.84, ncc: float | None = 0.95, **others: Any
+) -> StackQuality:
+    """The quality of a stack; `others` are further fields."""
+    fields = {"downweighted_share": 0.1} | others
+    return StackQuality(reliable=reliable, held_out_correlation=held_out, median_slice_ncc=ncc, **fields)
 
 
 def stack(

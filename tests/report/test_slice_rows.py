@@ -49,14 +49,9 @@ def rows_of(motion: RigidPose) -> SliceRows:
 def record_of(mean: RigidPose | None) -> RunRecord:
     """The record of a run in standard space, or in scanner space without a mean motion."""
     one = record()
-    matrix = None
-    if mean is not None:
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = mean.rotation[0], mean.translation_mm[0]
+    matrix = None if mean is None else mean.matrix[0].tolist()
     assert one.registration is not None
-    return replace(
-        one, registration=replace(one.registration, standard_from_scanner=None if matrix is None else matrix.tolist())
-    )
+    return replace(one, registration=replace(one.registration, standard_from_scanner=matrix))
 
 
 @pytest.mark.parametrize("space", MEANS)

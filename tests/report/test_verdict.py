@@ -8,11 +8,21 @@ from typing import Any
 import pytest
 
 from g3r.fitting.volume_check import VolumeCheck
+from g3r.output.assemble import rollback_warnings
 from g3r.output.record import RunRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import PRESETS
-from g3r.registration.quality import PARALLEL
-from g3r.registration.stack_quality import StackQuality
+from g3r.registration.quality import (
+    FAILED,
+    JUDGED,
+    LEFT_OUT,
+    NO_SLICE,
+    PARALLEL,
+    PERHAPS_MIRRORED,
+    PROBABLY_MIRRORED,
+    WITHOUT_SLICES,
+    pose_warnings,
+)
 from g3r.report.verdict import verdict_of
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE
 from g3r.run.context import StoppedAt
@@ -87,7 +97,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         CHECK,
         "c.nii was left out: it is probably a mirror image of what the other stacks show (handedness -0.13)",
     ),
-    "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
+    "not used": (stacks_with(stack("c.nii", WITHOUT_SLICES)), DO_NOT_USE, "c.nii was not used"),
     "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
     "doubtful by a hair": (
         stacks_with(stack("c.nii", quality(True, 0.6799))),
@@ -95,7 +105,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         "c.nii agrees only just with the other stacks (0.67; good is 0.68 and above)",
     ),
     "unlike": (
-        stacks_with(stack("c.nii", StackQuality(True, 0.81, 0.82, 0.0))),
+        stacks_with(stack("c.nii", quality(True, 0.81, 0.82))),
         CHECK,
         "the slices of c.nii agree with the volume by 0.82, those of another stack by 0.95",
     ),
@@ -192,16 +202,36 @@ def test_a_warning_with_words_of_its_own_is_not_said_twice() -> None:
     share = unseen(0.1)
     lines = [
         "b.nii: registration probably failed (correlation ...); do not rely on the volume",
-        "the loss of the fit rose: 1 times it went back to its best state; look at the volume",
+        *rollback_warnings(1),
         str(share.line()),
     ]
     found = record(stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
     assert len(verdict_of(found).reasons) == 3
 
 
+def test_warnings_about_a_quality_are_those_that_the_verdict_says_otherwise() -> None:
+    """Each start begins a warning of registration, and the verdict has one reason for it."""
+    mirrored = replace(quality(False), handedness=-0.13)
+    judged = {
+        LEFT_OUT: replace(mirrored, left_out=True),
+        NO_SLICE: WITHOUT_SLICES,
+        PERHAPS_MIRRORED: replace(mirrored, reliable=True),
+        PROBABLY_MIRRORED: mirrored,
+        FAILED: quality(False, 0.31),
+    }
+    assert set(judged) == set(JUDGED)
+    for start, one in judged.items():
+        named: Any = stack("c.nii", one)
+        registration: Any = None
+        (line,) = pose_warnings(registration, [one], [named])
+        assert line.startswith(f"c.nii: {start}")
+        found = stacks_with(named)
+        assert verdict_of(replace(found, warnings=[line])) == verdict_of(found)
+
+
 def test_stacks_that_agree_about_as_well_as_each_other_are_not_mentioned() -> None:
-    assert verdict_of(stacks_with(stack("c.nii", StackQuality(True, 0.8, 0.9, 0.0)))).word == USE
-    failed = verdict_of(stacks_with(stack("c.nii", StackQuality(False, 0.4, 0.5, 0.0))))
+    assert verdict_of(stacks_with(stack("c.nii", quality(True, 0.8, 0.9)))).word == USE
+    failed = verdict_of(stacks_with(stack("c.nii", quality(False, 0.4, 0.5))))
     assert len(failed.reasons) == 1
 
 
