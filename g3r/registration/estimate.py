@@ -18,9 +18,9 @@ from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.handedness import handedness
-from g3r.registration.held_out import estimate_interleave, held_out_score
+from g3r.registration.held_out import held_out_score
 from g3r.registration.intruder import misfit_without_each
-from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time, estimate_interleave
 from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
@@ -246,7 +246,7 @@ def segments_of(
     n_segments, interleave = [], list[int | None]()
     for sample in samples:
         own = motion.take(sample.rows)
-        order = estimate_interleave(sample, own)
+        order = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
         moves = changes_in_time(own, sample.slice_index, sample.pixels.center_mm, order)
         n_segments.append(1 + int((moves > same_mm).sum()))
         interleave.append(order if n_segments[-1] > 1 else None)

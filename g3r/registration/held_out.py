@@ -15,7 +15,7 @@ from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.motion_segments import changes_in_time, time_orders, transition_penalty
+from g3r.registration.motion_segments import changes_in_time, estimate_interleave, transition_penalty
 from g3r.registration.similarity import (
     CORRELATION_AREA_MM2,
     StackSamples,
@@ -189,7 +189,8 @@ def held_out_score(
     for sample in samples:
         volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM, fill)
         own = motion.take(sample.rows)
-        predictions.append(predict(sample, own, volume, grid, estimate_interleave(sample, own)))
+        interleave = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
+        predictions.append(predict(sample, own, volume, grid, interleave))
     return HeldOutScore(predictions)
 
 
@@ -232,15 +233,6 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
         varies = seen.sum() > 1 and predicted.std() > 0 and given.std() > 0
         found.append(float(np.corrcoef(predicted, given)[0, 1]) if varies else 0.0)
     return found
-
-
-def estimate_interleave(sample: StackSamples, motion: RigidPose) -> int:
-    """The interleave under which a stack's motions [K] change least."""
-    penalties = {
-        n: transition_penalty(changes_in_time(motion, sample.slice_index, sample.pixels.center_mm, n))
-        for n in time_orders(sample.slice_index)
-    }
-    return min(penalties, key=lambda n: penalties[n])
 
 
 def best_initialisation(

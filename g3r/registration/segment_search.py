@@ -10,14 +10,8 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import fit_rigid_robust
-from g3r.registration.held_out import (
-    HELD_OUT_VOXEL_MM,
-    HeldOutScore,
-    estimate_interleave,
-    held_out_score,
-    predict,
-    volume_without,
-)
+from g3r.registration.held_out import HELD_OUT_VOXEL_MM, HeldOutScore, held_out_score, predict, volume_without
+from g3r.registration.motion_segments import estimate_interleave
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.similarity import StackSamples
@@ -137,7 +131,8 @@ def _search_orientations(
     if fill is not None:  # the others' pixels may lie at one side of the head
         target = fill.center_mm
     own = motion.take(sample.rows)
-    present = predict(sample, own, volume, grid, estimate_interleave(sample, own))
+    interleave = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
+    present = predict(sample, own, volume, grid, interleave)
     if present.correlation > IN_PLACE_CORRELATION:
         return None
     best, cost = None, present.cost

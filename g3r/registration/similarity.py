@@ -160,8 +160,8 @@ def slice_costs(
 ) -> NDArray[np.float64]:
     """Negative log likelihood [K, J] of slices k in a volume under motions j.
 
-    Of Student's t form with the noise level of a slice that fits, so that a slice with signal loss counts less. The
-    volume is interpolated to half the voxel size and read at the nearest voxel.
+    The noise is that of a slice that fits (`student_cost`). The volume is interpolated to half the voxel size and read
+    at the nearest voxel.
 
     Args:
         pixels: of K slices.
@@ -171,7 +171,18 @@ def slice_costs(
     """
     residual = mean_square_residual(pixels.moments(*halved_voxels(volume, grid), motion, nearest=True)).T
     noise = float(np.median(residual.min(1))) + 1e-12
-    n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
+    return student_cost(residual, noise, pixels.area_mm2)
+
+
+def student_cost(residual: NDArray[np.float64], noise: float, area_mm2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Negative log likelihood [K, J] of Student's t form, so that a slice with signal loss counts less.
+
+    Args:
+        residual: [K, J] mean square residual of slices k under motions j.
+        noise: mean square residual of a slice that fits.
+        area_mm2: [K] of the slices.
+    """
+    n_samples = area_mm2 / CORRELATION_AREA_MM2
     return n_samples[:, None] * np.log1p(residual / (2 * noise))
 
 
