@@ -12,9 +12,9 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration.atlas_search import FittedTemplate
-from g3r.registration.pose_sampling import angle_deg, perturbed, rotations_about, uniform_rotations
+from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
 from g3r.registration.segment_search import aligned_to
-from g3r.registration.similarity import SearchPixels, correlation
+from g3r.registration.similarity import SearchPixels, correlation, random_climb
 from g3r.registration.so3_search import N_FOLLOWED_OF_STACK, N_ORIENTATIONS, STACK_DISTANCE_DEG, best_orientations
 from g3r.registration.thresholds import MIN_ATLAS_CORRELATION, MIN_RIVAL_MARGIN
 
@@ -142,12 +142,8 @@ def _moved_to(
     rng: np.random.Generator,
 ) -> _Fit:
     """The best fit of all slices to a template, after some of `ROUNDS`."""
-    agreement = np.zeros(1)
-    for rotation_deg, translation_mm in rounds:
-        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
-        agreement = correlation(pixels.moments(template.volume, template.grid, candidate).sum(1))
-        motion = candidate.take([int(agreement.argmax())])
-    return _Fit(float(agreement.max()), motion, template)
+    motion, highest = random_climb(pixels, template.volume, template.grid, motion, rounds, N_CANDIDATES, rng)
+    return _Fit(highest, motion, template)
 
 
 def centred_on_headers(slices: Slices) -> Slices:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.area_profile import AreaProfile, area_profiles
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.pose_sampling import perturbed
 from g3r.registration.similarity_kernels import model_sums
 
 PIXELS_PER_SLICE = 100
@@ -233,8 +235,45 @@ def correlation(moments: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(defined, (ym - y * m / n) / np.sqrt(np.where(defined, product, 1.0)), 0.0)
 
 
+def random_climb(
+    pixels: SearchPixels,
+    volume: NDArray[np.float32],
+    grid: VolumeGrid,
+    motion: RigidPose,
+    rounds: Sequence[tuple[float, float]],
+    n_candidates: int,
+    rng: np.random.Generator,
+) -> tuple[RigidPose, float]:
+    """The motion [1] that fits all slices together best to a volume, by random steps from the best so far.
+
+    Args:
+        pixels: of K slices.
+        volume: [I, J, K].
+        grid: its grid.
+        motion: [1] to start from.
+        rounds: standard deviations of random rotations (degrees) and translations (mm), round by round.
+        n_candidates: random motions in each round.
+        rng: source of randomness.
+
+    Returns:
+        The motion, and the correlation of all pixels under it.
+    """
+    agreement = np.zeros(1)
+    for rotation_deg, translation_mm in rounds:
+        candidate = perturbed(motion, pixels.center_mm, n_candidates, rotation_deg, translation_mm, rng)
+        agreement = correlation(pixels.moments(volume, grid, candidate).sum(1))
+        motion = candidate.take([int(agreement.argmax())])
+    return motion, float(agreement.max())
+
+
 def mean_square_residual(moments: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of (y - g m)^2 [...] at the best gain g in `GAIN_RANGE`, from moments [..., 6]."""
     n, _, _, yy, mm, ym = np.moveaxis(moments, -1, 0)
-    gain = np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE)
+    gain = best_gain(moments, GAIN_RANGE)
     return np.maximum(yy - 2 * gain * ym + gain**2 * mm, 0.0) / np.maximum(n, 1.0)
+
+
+def best_gain(moments: NDArray[np.float64], gain_range: tuple[float, float]) -> NDArray[np.float64]:
+    """The gain g [...] in a range with the least sum of (y - g m)^2, from moments [..., 6]."""
+    _, _, _, yy, mm, ym = np.moveaxis(moments, -1, 0)
+    return np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *gain_range)
