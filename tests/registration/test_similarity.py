@@ -13,6 +13,7 @@ from g3r.registration.similarity import (
     CORRELATION_AREA_MM2,
     GAIN_RANGE,
     SearchPixels,
+    best_gain,
     halved_voxels,
     mean_square_residual,
     own_moments,
@@ -194,6 +195,11 @@ def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.rando
         for a, b in zip(y, m, strict=True)
     ]
     np.testing.assert_allclose(mean_square_residual(moments), expected, rtol=1e-4)
+    np.testing.assert_allclose(best_gain(moments, (0.01, 100.0)), (y * m).sum(1) / (m * m).sum(1))
+
+
+def test_the_best_gain_of_a_slice_where_the_volume_is_empty_is_the_lowest() -> None:
+    assert best_gain(np.array([10.0, 5, 0, 4, 0, 0]), (0.05, 20.0)) == 0.05
 
 
 def test_the_residual_of_an_empty_model_is_the_image_and_never_negative() -> None:
