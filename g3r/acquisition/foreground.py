@@ -177,9 +177,8 @@ class Votes:
     def of(cls, slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Votes:
         """Count the votes; see `foreground`."""
         counts = np.ones(len(slices)) if weight is None else np.asarray(weight, dtype=np.float64)
-        planes = slices.planes
-        operator = VoxelOperator(planes, grid, slices.pixel_index, (1, 1, 5))
-        amount = planes.spacing_mm.prod(1) * slices.thickness_mm * counts / grid.voxel_volume_mm3
+        operator = VoxelOperator(slices.planes, grid, slices.pixel_index, (1, 1, 5))
+        amount = slices.pixel_volume_mm3 * counts / grid.voxel_volume_mm3
         inside = operator.adjoint(amount[operator.plane].astype(np.float32))
         density = coverage(slices, grid, counts)
         stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]

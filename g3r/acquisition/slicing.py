@@ -128,11 +128,18 @@ def by_headers(slices: Slices, stacks: Sequence[Stack]) -> Slices:
 
 def slice_spacing_mm(stack: Slices) -> float:
     """Median distance between neighbouring slices of one stack by the header; the thickness of a single slice."""
+    return float(np.median(np.abs(steps_along_normal_mm(stack))))
+
+
+def steps_along_normal_mm(stack: Slices) -> NDArray[np.float64]:
+    """Steps [K - 1] from one slice number of a stack to the next along the normal, by the header.
+
+    Negative where the numbers rise against the normal; the thickness of a single slice [1].
+    """
     if len(stack) < 2:
-        return float(stack.thickness_mm[0])
-    normal = stack.header_pose.rotation[0, :, 2]
-    along = stack.header_pose.translation_mm @ normal
-    return float(np.median(np.abs(np.diff(along) / np.diff(stack.slice_index))))
+        return stack.thickness_mm[:1]
+    along = stack.header_pose.translation_mm @ stack.header_pose.rotation[0, :, 2]
+    return np.diff(along) / np.diff(stack.slice_index)
 
 
 def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:

@@ -103,7 +103,7 @@ def _seen_and_brain(stack: Slices, grid: VolumeGrid) -> tuple[NDArray[np.bool_],
     """Where the slices of a stack look [I, J, K], and the masked share of what they see there."""
     density = coverage(stack, grid)
     operator = VoxelOperator(stack.planes, grid, stack.pixel_index)
-    amount = stack.planes.spacing_mm.prod(1) * stack.thickness_mm / grid.voxel_volume_mm3
+    amount = stack.pixel_volume_mm3 / grid.voxel_volume_mm3
     masked = operator.adjoint(amount[operator.plane].astype(np.float32))
     return density > UNSEEN_BELOW, brain_share(masked, density)
 

@@ -107,8 +107,7 @@ def register(
         deadline: search and rounds are shortened to end by then, if they can.
     """
     given, slices = slices, bias_corrected(slices)
-    covered_mm3 = float(np.median(slices.planes.spacing_mm.prod(1) * slices.thickness_mm))
-    least_mm = settings.finest_voxel_pixels * covered_mm3 ** (1 / 3)
+    least_mm = settings.finest_voxel_pixels * slices.typical_pixel_mm
     settings = replace(settings, finest_voxel_mm=max(settings.finest_voxel_mm, least_mm))
     samples = StackSamples.of_all(slices, settings.n_candidates)
     single = len(samples) == 1

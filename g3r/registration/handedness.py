@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import mean
 
 import numpy as np
@@ -79,9 +79,8 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
         stacks, one is called a mirror image only if the others show that the head is asymmetric (`_stands_out`). With
         two stacks there is no such check, and a symmetric head may be below the limit by shading alone.
     """
-    value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
-    evened, rng = replace(slices, value=value), np.random.default_rng(seed)
-    found = [None if one is None else one.highest for one in _of_all(evened, rng).values()]
+    asymmetry = _of_all(slices.without_gain(gain), np.random.default_rng(seed))
+    found = [None if one is None else one.highest for one in asymmetry.values()]
     logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found))
     return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,8 +220,7 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     Returns:
         The correlation of each stack; 0 where the others saw nothing of it.
     """
-    value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
-    evened = replace(slices, value=value)
+    evened = slices.without_gain(gain)
     found = []
     for stack in np.unique(slices.stack_id):
         volume, share, grid = fine_volume_without(evened, stack)

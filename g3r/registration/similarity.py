@@ -62,7 +62,7 @@ class SearchPixels:
             point_mm=point,
             value=np.where(mask, slices.value[index], 0).astype(np.float32),
             start=np.concatenate([[0], np.cumsum([len(c) for c in chosen])]).astype(np.int64),
-            area_mm2=planes.shape.prod(1) * planes.spacing_mm.prod(1),
+            area_mm2=planes.shape.prod(1) * planes.pixel_area_mm2,
             center_mm=point[mask].mean(0) if mask.any() else point.mean(0),
         )
 
