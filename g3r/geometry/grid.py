@@ -87,6 +87,13 @@ class VolumeGrid:
         motion[:3, :3], motion[:3, 3] = pose.rotation[0], pose.translation_mm[0]
         return VolumeGrid(self.shape, motion @ self.affine)
 
+    def scaled_about(self, center_mm: NDArray[np.float64], scale: float) -> VolumeGrid:
+        """The same voxels enlarged by a factor about a point [3] that stays in place."""
+        affine = self.affine.copy()
+        affine[:3, :3] *= scale
+        affine[:3, 3] = center_mm + scale * (self.affine[:3, 3] - center_mm)
+        return VolumeGrid(self.shape, affine)
+
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
         """Distance between neighbouring voxels along each axis [3]."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.area_profile import AreaProfile
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, centred_on_headers, standard_orientation
@@ -29,7 +29,6 @@ from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, fitted_in_place, refine_slices
 from g3r.registration.stack_quality import StackQuality
 from g3r.registration.thresholds import MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
-from g3r.registration.unseen import TemplateFill
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -159,7 +158,7 @@ def register(
     )
 
 
-def measured_again(registration: Registration, fill: TemplateFill | None = None) -> Registration:
+def measured_again(registration: Registration, fill: PlacedHead | None = None) -> Registration:
     """The registration with its measures of quality computed anew, for slices with other masks.
 
     Args:

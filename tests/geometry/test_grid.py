@@ -26,6 +26,16 @@ AXES = {
 }
 
 
+def test_a_grid_scaled_about_a_point_keeps_that_point_and_its_shape() -> None:
+    grid = VolumeGrid((4, 5, 6), affine_of(AXES["oblique"], (1.0, 2.0, 3.0), (5.0, -7.0, 2.0)))
+    center_mm = np.array([3.0, 1.0, -4.0])
+    scaled = grid.scaled_about(center_mm, 1.5)
+    index = np.array([[0.0, 0, 0], [3, 4, 5], [1.5, 2, 0.5]])
+    np.testing.assert_allclose(scaled.world(index) - center_mm, 1.5 * (grid.world(index) - center_mm), atol=1e-12)
+    np.testing.assert_allclose(scaled.index(center_mm), grid.index(center_mm), atol=1e-12)
+    assert scaled.shape == grid.shape
+
+
 @pytest.mark.parametrize("origin", [(-40.0, 30.0, 12.5), (1e4, -1e4, 1e4)])
 @pytest.mark.parametrize("name", AXES)
 def test_world_and_index_are_inverse(name: str, origin: tuple[float, float, float]) -> None:
