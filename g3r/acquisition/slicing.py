@@ -33,7 +33,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         raise InputError("no stack given; pass at least one")
     rotation, center, spacing, shape, psf = [], [], [], [], []
     values, masks, stack_id, slice_index, thickness = [], [], [], [], []
-    extent, distance, beyond = [], [], []
+    extent, slice_spacing, beyond = [], [], []
     for number, stack in enumerate(stacks):
         axes = stack.affine[:3, :3] / stack.spacing_mm
         # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
@@ -58,7 +58,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             thickness.append(stack.thickness_mm)
             whole = np.array([(-0.5, n - 0.5) for n in inside.shape]) - np.array(middle[:2])[:, None]
             extent.append(whole * stack.spacing_mm[:2, None])
-            distance.append(stack.spacing_mm[2] * np.sign(frame[:, 2] @ axes[:, 2]))
+            slice_spacing.append(stack.spacing_mm[2] * np.sign(frame[:, 2] @ axes[:, 2]))
             beyond.append([n_beyond[0] if k == used[0] else 0, n_beyond[1] if k == used[-1] else 0])
     if not rotation:
         raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
@@ -78,7 +78,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         thickness_mm=np.array(thickness),
         header_pose=planes.pose,
         view=FieldsOfView(
-            extent_mm=np.array(extent), spacing_mm=np.array(distance), n_beyond=np.array(beyond, dtype=np.int64)
+            extent_mm=np.array(extent), spacing_mm=np.array(slice_spacing), n_beyond=np.array(beyond, dtype=np.int64)
         ),
     )
 
