@@ -264,17 +264,14 @@ def volume_planes(grid: VolumeGrid) -> Planes:
     Raises:
         ValueError: a grid whose axes are sheared.
     """
-    spacing = grid.spacing_mm
-    axes = grid.affine[:3, :3] / spacing
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-6:
+    if grid.shear > 1e-6:
         raise ValueError("planes need a grid with orthogonal axes")
-    frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
     n_i, n_j, n_k = grid.shape
     index = np.stack([np.full(n_k, (n_i - 1) / 2), np.full(n_k, (n_j - 1) / 2), np.arange(n_k)], axis=1)
     return Planes(
-        rotation=np.tile(frame, (n_k, 1, 1)),
+        rotation=np.tile(grid.plane_frame, (n_k, 1, 1)),
         center_mm=grid.world(index),
-        spacing_mm=np.tile(spacing[:2], (n_k, 1)),
+        spacing_mm=np.tile(grid.spacing_mm[:2], (n_k, 1)),
         shape=np.tile([n_i, n_j], (n_k, 1)),
         psf_var_mm2=np.zeros((n_k, 3)),
     )

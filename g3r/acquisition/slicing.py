@@ -15,6 +15,7 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 from g3r.geometry.grid import bounding_box
+from g3r.geometry.rigid import orthonormal
 
 MIN_SLICE_PIXELS = 12
 """Fewest masked pixels of a slice. Slices with fewer determine no pose and show little; they are skipped and named in
@@ -35,11 +36,9 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
     values, masks, stack_id, slice_index, thickness = [], [], [], [], []
     extent, slice_spacing, beyond = [], [], []
     for number, stack in enumerate(stacks):
-        axes = stack.affine[:3, :3] / stack.spacing_mm
         # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
-        frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
-        left, _, right = np.linalg.svd(frame)
-        frame = left @ right
+        frame = orthonormal(stack.grid.plane_frame[None])[0]
+        step_mm = stack.spacing_mm[2] * np.sign(frame[:, 2] @ stack.grid.axes[:, 2])
         used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
         n_beyond = _slices_beyond(stack, used)
         for k in used:
@@ -58,7 +57,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             thickness.append(stack.thickness_mm)
             whole = np.array([(-0.5, n - 0.5) for n in inside.shape]) - np.array(middle[:2])[:, None]
             extent.append(whole * stack.spacing_mm[:2, None])
-            slice_spacing.append(stack.spacing_mm[2] * np.sign(frame[:, 2] @ axes[:, 2]))
+            slice_spacing.append(step_mm)
             beyond.append([n_beyond[0] if k == used[0] else 0, n_beyond[1] if k == used[-1] else 0])
     if not rotation:
         raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")

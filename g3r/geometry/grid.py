@@ -100,6 +100,23 @@ class VolumeGrid:
         return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0), dtype=np.float64)
 
     @property
+    def axes(self) -> NDArray[np.float64]:
+        """Unit vectors along the axes in the world, as columns [3, 3]."""
+        return self.affine[:3, :3] / self.spacing_mm
+
+    @property
+    def shear(self) -> float:
+        """Largest cosine between two axes; 0 if they are orthogonal."""
+        axes = self.axes
+        return float(np.abs(axes.T @ axes - np.eye(3)).max())
+
+    @property
+    def plane_frame(self) -> NDArray[np.float64]:
+        """First axis, second axis and their normal as columns [3, 3]; right-handed, whatever the third axis is."""
+        axes = self.axes
+        return np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
+
+    @property
     def voxel_volume_mm3(self) -> float:
         """Volume of a voxel."""
         return float(abs(np.linalg.det(self.affine[:3, :3])))
