@@ -39,7 +39,7 @@ def filled_with_head(
         volume: [I, J, K] of some slices.
         grid: its grid.
         coverage: [I, J, K] pixels of those slices (outside the head, too), spread by the PSF.
-        head: of the template, in the frame of the slices, blurred as thick slices are.
+        head: of the template, in the frame of the slices.
     """
     template = on_grid(head.volume, head.grid, grid, 0.0)
     share = coverage_share(coverage)
