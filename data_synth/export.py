@@ -86,7 +86,7 @@ def _write(folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], r
             counts = np.clip(np.rint(stack.image), np.iinfo(np.int16).min, np.iinfo(np.int16).max)
             save_volume(folder / f"stack-{number}.nii.gz", counts.astype(np.int16), stack.affine)
             save_volume(folder / f"mask-{number}.nii.gz", stack.mask, stack.affine)
-            frame = stack.affine[:3, :3] / stack.spacing_mm
+            frame = stack.grid.axes
             n_i, n_j, n_k = stack.image.shape
             rotvec, pose = one.true_pose.rotvec_rad(), one.true_pose
             for k in range(n_k):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ from data_synth.subject_cache import SubjectCache, SyntheticSubject
 from data_synth.subject_dataset import SubjectDataset
 from data_synth.template import HALF_WINDOW_WEEKS
 from data_synth.uneven_coverage import with_uneven_coverage
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.coverage import brain_share, coverage
 from g3r.acquisition.least_squares import sharpened_volume
@@ -50,8 +49,8 @@ DISTRUSTED_SHARE = 0.15
 DISTRUSTED_SLICES = 4
 
 OTHER_AGE_WEEKS = (HALF_WINDOW_WEEKS + 0.5, HALF_WINDOW_WEEKS + 3.5)
-"""Range of the age difference between a training subject and its template. A nearer template is a mean of heads with the
-subject itself among them; subjects in use never have so similar a template."""
+"""Range of the age difference between a training subject and its template. A nearer template is a mean of heads with
+the subject itself among them; subjects in use never have so similar a template."""
 START_DEG, START_MM, START_SCALE = 2.0, 1.5, 0.03
 """Standard deviations of the template's rotation and translation per axis before it is fitted, and of its log size. The
 rotation of a head by augmentation (`augment.py`) comes on top."""
@@ -140,13 +139,13 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         head = self._template_head(weeks_of(self.subjects[which], USUAL_WEEKS), rng)
         return synthesise(truth, head, rng, n_stacks, self.artefact_share)
 
-    def _template_head(self, weeks: float, rng: np.random.Generator) -> TemplateHead:
+    def _template_head(self, weeks: float, rng: np.random.Generator) -> PlacedHead:
         """The template to fit: nearest in age for validation, and of another age for training if there is one."""
         apart = np.abs(self.template.weeks - weeks)
         nearest, furthest = OTHER_AGE_WEEKS
         others = np.flatnonzero((apart >= nearest) & (apart <= furthest))
         chosen = int(apart.argmin()) if self.in_order or not len(others) else int(rng.choice(others))
-        return TemplateHead(self.template.volume[chosen], self.template.grid)
+        return self.template.head(chosen)
 
 
 def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int]) -> list[NDArray[np.int64]]:
@@ -163,22 +162,9 @@ def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int
     return list(np.clip(center - size // 2, 0, np.array(mask.shape) - size))
 
 
-@dataclass(frozen=True)
-class TemplateHead:
-    """One head of an atlas template, in the atlas frame.
-
-    Args:
-        volume: [I, J, K] float32, zero outside the brain.
-        grid: of the volume, centred at the origin.
-    """
-
-    volume: NDArray[np.float32]
-    grid: VolumeGrid
-
-
 def synthesise(
     truth: TruthVolume,
-    template: TemplateHead,
+    template: PlacedHead,
     rng: np.random.Generator,
     n_stacks: int | None = None,
     artefact_share: float = 0.0,
@@ -189,7 +175,7 @@ def synthesise(
 
     Args:
         truth: the head.
-        template: to be fitted to the seen part of the head.
+        template: in the atlas frame, to be fitted to the seen part of the head.
         rng: source of randomness.
         n_stacks: number of stacks; None draws it.
         artefact_share: see `with_artefacts`.
@@ -220,8 +206,7 @@ def synthesise(
     scale = np.float32(normalisation_scale(coarse, masked))
     inside = np.where(truth.mask, truth.data, 0) / scale
     sharp = sharp / scale
-    placed = _placed(template, truth, rng)
-    fitted = fit_template(template.volume, placed, sharp, share, np.minimum(density, 1), grid)
+    fitted = fit_template(_placed(template, truth, rng), sharp, share, density, grid)
     return SyntheticSubject(
         coarse=coarse / scale,
         density=density,
@@ -236,8 +221,8 @@ def synthesise(
     )
 
 
-def _placed(template: TemplateHead, truth: TruthVolume, rng: np.random.Generator) -> VolumeGrid:
-    """The template's grid, placed at the head with about the error of a registration."""
+def _placed(template: PlacedHead, truth: TruthVolume, rng: np.random.Generator) -> PlacedHead:
+    """The template, placed at the head with about the error of a registration."""
     head_grid = VolumeGrid(truth.data.shape, truth.affine)
     here, there = head_grid.world(np.argwhere(truth.mask)), template.grid.world(np.argwhere(template.volume > 0))
     size_mm, template_size_mm = ((points - points.mean(0)).std() for points in (here, there))
@@ -246,8 +231,8 @@ def _placed(template: TemplateHead, truth: TruthVolume, rng: np.random.Generator
     affine = np.eye(4)
     affine[:3, :3] = scale * turn @ template.grid.affine[:3, :3]
     shift_mm = here.mean(0) + rng.normal(0, START_MM, 3)
-    affine[:3, 3] = shift_mm + scale * turn @ (template.grid.affine[:3, 3] - there.mean(0))
-    return VolumeGrid(template.grid.shape, affine)
+    affine[:3, 3] = shift_mm + scale * turn @ (template.grid.affine[:3, 3] - template.center_mm)
+    return PlacedHead(template.volume, VolumeGrid(template.grid.shape, affine), shift_mm)
 
 
 def _registered_poses(

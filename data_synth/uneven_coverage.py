@@ -105,8 +105,7 @@ def _with_cuts(stacks: Sequence[SimulatedStack], rng: np.random.Generator) -> li
 def _cut(one: SimulatedStack, direction: NDArray[np.float64], share: float) -> SimulatedStack:
     """A stack without the end of the head in a direction, cut perpendicular to the stack axis closest to it."""
     stack = one.stack
-    axes = stack.affine[:3, :3] / stack.spacing_mm
-    along = axes.T @ direction
+    along = stack.grid.axes.T @ direction
     axis = int(np.argmax(np.abs(along)))
     marked = np.flatnonzero(stack.mask.any(tuple(other for other in range(3) if other != axis)))
     n = min(round(share * len(marked)), len(marked) - MIN_SLICES)

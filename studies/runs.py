@@ -143,8 +143,7 @@ def figures(scores: Scores) -> dict[str, float]:
 
 def orientation_deg(case: SimulatedCase, truth_from_result: RigidPose) -> float:
     """Angle between a result's frame and the atlas frame, whose axes are the voxel axes of the truth."""
-    axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
-    turn = RigidPose((axes.T @ truth_from_result.rotation[0])[None], np.zeros((1, 3)))
+    turn = RigidPose((case.truth.grid.axes.T @ truth_from_result.rotation[0])[None], np.zeros((1, 3)))
     return float(np.rad2deg(np.linalg.norm(turn.rotvec_rad())))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.slicing import slice_spacing_mm
+from g3r.acquisition.slicing import slice_spacing_mm, steps_along_normal_mm
 
 MIN_MISSING_AREA = 0.2
 """Slices missing between others count from this share of the largest area. Smaller ones are at the tips of the head,
@@ -144,7 +144,7 @@ def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
     stack = slices.take(of_stack)
     number, plane = stack.slice_index, stack.pixel_plane
     count = np.bincount(plane, minlength=len(stack))
-    area = count * stack.planes.spacing_mm.prod(1)
+    area = count * stack.planes.pixel_area_mm2
     header = stack.planes.with_pose(stack.header_pose)
     point = header.pixel_world_mm(stack.pixel_index)
     sums = np.stack([np.bincount(plane, point[:, axis], minlength=len(stack)) for axis in range(3)], axis=1)
@@ -170,7 +170,8 @@ def _continued(
     """The profile continued beyond its cut ends; the middle of the area moves on along the normal."""
     before, after = _beyond(profile, _length_of_others_mm(slices, of_stack), volume_mm3)
     first, last = -np.arange(len(before), 0, -1), np.arange(1, len(after) + 1)
-    step = _step_mm(slices.take(of_stack))
+    stack = slices.take(of_stack)
+    step = stack.header_pose.rotation[0, :, 2] * float(np.median(steps_along_normal_mm(stack)))
     return AreaProfile(
         index=np.concatenate([profile.index[0] + first, profile.index, profile.index[-1] + last]),
         area_mm2=np.concatenate([before[::-1], profile.area_mm2, after]),
@@ -185,15 +186,6 @@ def _continued(
         spacing_mm=profile.spacing_mm,
         cut=profile.cut,
     )
-
-
-def _step_mm(stack: Slices) -> NDArray[np.float64]:
-    """Step from one slice to the next [3] by the header, along the normal."""
-    normal = stack.header_pose.rotation[0, :, 2]
-    along = stack.header_pose.translation_mm @ normal
-    if len(stack) < 2:
-        return normal * float(stack.thickness_mm[0])
-    return normal * float(np.median(np.diff(along) / np.diff(stack.slice_index)))
 
 
 def _length_of_others_mm(slices: Slices, of_stack: NDArray[np.bool_]) -> float | None:

@@ -11,6 +11,36 @@ from g3r.geometry import VolumeGrid
 
 
 @dataclass(frozen=True)
+class PlacedHead:
+    """One head of an atlas template where it lies in space.
+
+    Args:
+        volume: [I, J, K] float32, zero outside the brain.
+        grid: its grid.
+        center_mm: [3] of the head.
+    """
+
+    volume: NDArray[np.float32]
+    grid: VolumeGrid
+    center_mm: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, volume: NDArray[np.float32], grid: VolumeGrid) -> PlacedHead:
+        """A head whose centre is the mean position of its brain.
+
+        Args:
+            volume: [I, J, K] float32, zero outside the brain.
+            grid: its grid.
+        """
+        return cls(volume, grid, grid.world(np.argwhere(volume > 0)).mean(0))
+
+    def box_mm(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest corner of its brain, [3] each."""
+        inside = self.grid.world(np.argwhere(self.volume > 0))
+        return inside.min(0), inside.max(0)
+
+
+@dataclass(frozen=True)
 class AtlasTemplate:
     """Mean heads by gestational age on one grid, in the atlas frame.
 
@@ -51,3 +81,17 @@ class AtlasTemplate:
         """Voxel grid of every head."""
         shape = self.volume.shape
         return VolumeGrid((shape[1], shape[2], shape[3]), self.affine)
+
+    def head(self, number: int) -> PlacedHead:
+        """One of the heads, in the atlas frame."""
+        return PlacedHead.of(self.volume[number], self.grid)
+
+    def scaled_head(self, weeks: float, scale: float) -> PlacedHead:
+        """The head nearest in age, enlarged about its centre.
+
+        Args:
+            weeks: the subject's age, as found by registration.
+            scale: factor by which a template of that age has to be enlarged.
+        """
+        head = self.head(int(np.abs(self.weeks - weeks).argmin()))
+        return PlacedHead.of(head.volume, head.grid.scaled_about(head.center_mm, scale))

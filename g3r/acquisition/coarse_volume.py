@@ -47,11 +47,10 @@ def coarse_and_density(
     Source: G3R Eq. 6, made dimensionless (docs/method.md).
     """
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index, _psf_points(slices, grid))
-    area_mm2 = slices.planes.spacing_mm.prod(1)
-    covered = ((area_mm2 * slices.thickness_mm) / grid.voxel_volume_mm3)[slices.pixel_plane]
+    covered = (slices.pixel_volume_mm3 / grid.voxel_volume_mm3)[slices.pixel_plane]
     if weight is not None:
         covered = covered * weight
-    value = slices.masked_value if gain is None else slices.masked_value / gain[slices.pixel_plane]
+    value = slices.masked_value_without(gain)
     density = operator.adjoint(covered.astype(np.float32))
     numerator = operator.adjoint((covered * value).astype(np.float32))
     supported = density > SUPPORT_DENSITY

@@ -49,13 +49,13 @@ def coverage(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | No
     amount_mm = slices.thickness_mm * (1.0 if weight is None else np.asarray(weight, np.float64))
     row, step = _with_beyond(view.n_beyond)
     center = planes.center_mm[row] + (step * view.spacing_mm[row])[:, None] * planes.rotation[row][:, :, 2]
-    index_to_plane = planes.rotation[row].transpose(0, 2, 1)
-    linear = index_to_plane @ grid.affine[:3, :3]
-    offset = np.einsum("kij,kj->ki", index_to_plane, grid.affine[:3, 3] - center)
+    plane_from_world = planes.rotation[row].transpose(0, 2, 1)
+    plane_from_index = plane_from_world @ grid.affine[:3, :3]
+    offset = np.einsum("kij,kj->ki", plane_from_world, grid.affine[:3, 3] - center)
     density = np.zeros(grid.shape, np.float32)
     _accumulate(
         density,
-        np.ascontiguousarray(linear),
+        np.ascontiguousarray(plane_from_index),
         offset,
         np.sqrt(np.maximum(planes.psf_var_mm2[row], 1e-12)),
         view.extent_mm[row],
@@ -88,7 +88,7 @@ def _with_beyond(n_beyond: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArra
 
 
 @numba.njit(parallel=True, nogil=True, cache=True)
-def _accumulate(density, linear, offset, sigma, extent, amount):
+def _accumulate(density, plane_from_index, offset, sigma, extent, amount):
     n_i, n_j, n_k = density.shape
     root2 = math.sqrt(2.0)
     for i in numba.prange(n_i):
@@ -96,7 +96,7 @@ def _accumulate(density, linear, offset, sigma, extent, amount):
             if amount[p] == 0.0:
                 continue
             # lengths in standard deviations of the slice's profile
-            m, per_sigma = linear[p] / sigma[p].reshape(3, 1), 1.0 / sigma[p]
+            m, per_sigma = plane_from_index[p] / sigma[p].reshape(3, 1), 1.0 / sigma[p]
             low, high = extent[p, :, 0] * per_sigma[:2], extent[p, :, 1] * per_sigma[:2]
             peak = amount[p] * per_sigma[2] / math.sqrt(2.0 * math.pi)
             for j in range(n_j):

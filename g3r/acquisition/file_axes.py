@@ -130,6 +130,6 @@ def between(start: VolumeGrid, end: VolumeGrid) -> RigidPose:
 
 def _nearest_rotation(grid: VolumeGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The rotation [3, 3] nearest to the axes, and factors [3] of its columns; the third is -1 for left-handed axes."""
-    left, _, right = np.linalg.svd(grid.affine[:3, :3] / grid.spacing_mm)
+    left, _, right = np.linalg.svd(grid.axes)
     mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     return left @ right * mirror, mirror

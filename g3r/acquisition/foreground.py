@@ -159,7 +159,7 @@ class Votes:
         brain, core, unseen, thin: see `Foreground`.
         density: [I, J, K] of slices over each voxel (`coverage`).
         rough: [I, J, K] share of the slices over a voxel whose masks contain it.
-        distance_voxels: the largest slice spacing of the stacks.
+        slice_spacing_voxels: the largest slice spacing of the stacks.
     """
 
     slices: Slices
@@ -171,25 +171,24 @@ class Votes:
     thin: NDArray[np.bool_]
     density: NDArray[np.float32]
     rough: NDArray[np.float32]
-    distance_voxels: float
+    slice_spacing_voxels: float
 
     @classmethod
     def of(cls, slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Votes:
         """Count the votes; see `foreground`."""
         counts = np.ones(len(slices)) if weight is None else np.asarray(weight, dtype=np.float64)
-        planes = slices.planes
-        operator = VoxelOperator(planes, grid, slices.pixel_index, (1, 1, 5))
-        amount = planes.spacing_mm.prod(1) * slices.thickness_mm * counts / grid.voxel_volume_mm3
+        operator = VoxelOperator(slices.planes, grid, slices.pixel_index, (1, 1, 5))
+        amount = slices.pixel_volume_mm3 * counts / grid.voxel_volume_mm3
         inside = operator.adjoint(amount[operator.plane].astype(np.float32))
         density = coverage(slices, grid, counts)
         stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
-        distance_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
-        distance_voxels = float(distance_mm.max() / grid.spacing_mm.mean())
-        sigma = 0.5 * distance_voxels
+        spacing_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
+        slice_spacing_voxels = float(spacing_mm.max() / grid.spacing_mm.mean())
+        sigma = 0.5 * slice_spacing_voxels
         thin = density < 2 * UNSEEN_BELOW * np.median(counts)
         inside, total = gaussian_filter(inside, sigma), gaussian_filter(density, sigma)
         thickness_mm = np.array([stack.thickness_mm[0] for stack in stacks])
-        lone = float((thickness_mm / distance_mm).min() * np.median(counts))
+        lone = float((thickness_mm / spacing_mm).min() * np.median(counts))
         seen = total > max(SEEN_SHARE * lone, np.finfo(np.float32).tiny)
         brain = seen & (inside > INSIDE_SHARE * total)
         if not brain.any():
@@ -206,7 +205,7 @@ class Votes:
             thin=thin,
             density=density,
             rough=rough,
-            distance_voxels=distance_voxels,
+            slice_spacing_voxels=slice_spacing_voxels,
         )
 
     def foreground(self) -> Foreground:
@@ -214,7 +213,7 @@ class Votes:
         voxel_mm = float(self.grid.spacing_mm.mean())
         share, rim_voxels = (~self.unseen).astype(np.float32), 1
         if self.slices.n_stacks > 1:
-            smooth_voxels = SMOOTH_SHARE * self.distance_voxels
+            smooth_voxels = SMOOTH_SHARE * self.slice_spacing_voxels
             share = _sharpened(self.rough, self.slices, self.grid, self.weight, smooth_voxels)
             share = np.where(self.unseen | self.thin, 0, share).clip(0, 1)
         else:

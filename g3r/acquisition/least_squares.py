@@ -41,7 +41,7 @@ def sharpened_volume(
         V_sharp [I, J, K] float32. Unlike V_coarse it may be negative, and it reaches a little beyond the support.
     """
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
-    value = slices.masked_value if gain is None else slices.masked_value / gain[slices.pixel_plane]
+    value = slices.masked_value_without(gain)
     slice_weight = np.ones(len(value)) if weight is None else weight
     return solve_volume(
         operator,

@@ -69,6 +69,11 @@ class Planes:
         return int(self.offset[-1])
 
     @property
+    def pixel_area_mm2(self) -> NDArray[np.float64]:
+        """Area of a pixel of each plane [K]."""
+        return self.spacing_mm.prod(1)
+
+    @property
     def pose(self) -> RigidPose:
         """Poses of the planes (world from plane)."""
         return RigidPose(self.rotation, self.center_mm)
@@ -186,6 +191,16 @@ class Slices:
         """The fields of view of the whole slices."""
         return FieldsOfView.of_planes(self.planes) if self.view is None else self.view
 
+    @property
+    def pixel_volume_mm3(self) -> NDArray[np.float64]:
+        """Volume that a pixel of each slice covers [K]: its area times the slice thickness."""
+        return self.planes.pixel_area_mm2 * self.thickness_mm
+
+    @property
+    def typical_pixel_mm(self) -> float:
+        """Cube root of the median volume that a pixel covers."""
+        return float(np.median(self.pixel_volume_mm3)) ** (1 / 3)
+
     @cached_property
     def pixel_index(self) -> NDArray[np.int64]:
         """Numbers of the pixels inside the mask [P']."""
@@ -200,6 +215,10 @@ class Slices:
     def masked_value(self) -> NDArray[np.float32]:
         """Values of the pixels inside the mask [P']."""
         return self.value[self.pixel_index]
+
+    def masked_value_without(self, gain: NDArray[np.floating] | None) -> NDArray[np.floating]:
+        """Values of the pixels inside the mask [P'] with gains [K] divided out; as they are when None."""
+        return self.masked_value if gain is None else self.masked_value / gain[self.pixel_plane]
 
     def take(self, index: Selection) -> Slices:
         """The slices at an index array or mask, with their pixels."""
@@ -230,6 +249,10 @@ class Slices:
         """The same slices with their values multiplied by a factor."""
         return replace(self, value=(self.value * np.float32(factor)).astype(np.float32))
 
+    def without_gain(self, gain: NDArray[np.floating]) -> Slices:
+        """The same slices with their values divided by gains [K]."""
+        return replace(self, value=(self.value / gain[self.planes.plane_id()]).astype(np.float32))
+
     def world_from_header(self) -> RigidPose:
         """Motion of each slice: maps a point at its header position to its present one."""
         return self.planes.pose @ self.header_pose.inverse()
@@ -241,17 +264,14 @@ def volume_planes(grid: VolumeGrid) -> Planes:
     Raises:
         ValueError: a grid whose axes are sheared.
     """
-    spacing = grid.spacing_mm
-    axes = grid.affine[:3, :3] / spacing
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-6:
+    if grid.shear > 1e-6:
         raise ValueError("planes need a grid with orthogonal axes")
-    frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
     n_i, n_j, n_k = grid.shape
     index = np.stack([np.full(n_k, (n_i - 1) / 2), np.full(n_k, (n_j - 1) / 2), np.arange(n_k)], axis=1)
     return Planes(
-        rotation=np.tile(frame, (n_k, 1, 1)),
+        rotation=np.tile(grid.plane_frame, (n_k, 1, 1)),
         center_mm=grid.world(index),
-        spacing_mm=np.tile(spacing[:2], (n_k, 1)),
+        spacing_mm=np.tile(grid.spacing_mm[:2], (n_k, 1)),
         shape=np.tile([n_i, n_j], (n_k, 1)),
         psf_var_mm2=np.zeros((n_k, 3)),
     )

@@ -63,8 +63,7 @@ def slice_images(slices: Slices, pixel_mm: float, size: int) -> SliceImages:
     planes, pixel, plane = slices.planes, slices.pixel_index, slices.pixel_plane
     _, stack_id = np.unique(slices.stack_id, return_inverse=True)
     uv = planes.pixel_uv_mm()[pixel]
-    pixel_area = planes.spacing_mm.prod(1)
-    area = np.bincount(plane, minlength=len(slices)) * pixel_area
+    area = np.bincount(plane, minlength=len(slices)) * planes.pixel_area_mm2
 
     # positions in the frame of each stack's first slice; by the header all slices of a stack are parallel
     first = np.array([np.flatnonzero(stack_id == s)[0] for s in range(stack_id.max() + 1)])[stack_id]
@@ -85,7 +84,7 @@ def slice_images(slices: Slices, pixel_mm: float, size: int) -> SliceImages:
     frame = RigidPose.from_rotvec(np.zeros((len(slices), 3)), shift * [1, 1, 0])
 
     images = np.zeros(len(slices) * size * size)
-    share = pixel_area[plane] / (pixel_mm * SUBPIXELS) ** 2
+    share = planes.pixel_area_mm2[plane] / (pixel_mm * SUBPIXELS) ** 2
     for part in np.ndindex(SUBPIXELS, SUBPIXELS):
         offset = ((np.array(part) + 0.5) / SUBPIXELS - 0.5) * planes.spacing_mm[plane]
         index = np.floor((uv + offset - shift[plane, :2]) / pixel_mm + size / 2).astype(np.int64)

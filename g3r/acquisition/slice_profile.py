@@ -92,11 +92,11 @@ def find_slice_profile(
     """
     name = Path(path).name
     if earlier is None:
-        distance_mm = float(np.asarray(spacing_mm)[slice_axis])
+        slice_spacing_mm = float(np.asarray(spacing_mm)[slice_axis])
         sidecar = read_sidecar(sidecar_path(path))
         if sidecar is not None:
-            _check_distance(sidecar, distance_mm, name)
-        profile = _profile(*_thickness(sidecar, distance_mm, thickness_mm, name), sidecar, slice_axis)
+            _check_slice_spacing(sidecar, slice_spacing_mm, name)
+        profile = _profile(*_thickness(sidecar, slice_spacing_mm, thickness_mm, name), sidecar, slice_axis)
     elif thickness_mm is None:
         profile = earlier
     else:
@@ -113,24 +113,24 @@ def find_slice_profile(
     return profile
 
 
-def _check_distance(sidecar: Sidecar, distance_mm: float, name: str) -> None:
+def _check_slice_spacing(sidecar: Sidecar, slice_spacing_mm: float, name: str) -> None:
     """Raise `InputError` for a sidecar whose slices are not as far apart as the image's."""
     said_mm = sidecar.spacing_mm
-    if said_mm is not None and not _agree(said_mm, distance_mm):
+    if said_mm is not None and not _agree(said_mm, slice_spacing_mm):
         raise InputError(
-            f"{sidecar.name}: SpacingBetweenSlices is {said_mm:g} mm; expected the {distance_mm:.4g} mm between slices "
-            f"of {name} by its header, pass the image that the file is of, or remove the file"
+            f"{sidecar.name}: SpacingBetweenSlices is {said_mm:g} mm; expected the {slice_spacing_mm:.4g} mm between "
+            f"slices of {name} by its header, pass the image that the file is of, or remove the file"
         )
 
 
 def _thickness(
-    sidecar: Sidecar | None, distance_mm: float, given_mm: float | None, name: str
+    sidecar: Sidecar | None, slice_spacing_mm: float, given_mm: float | None, name: str
 ) -> tuple[float, ThicknessSource]:
     """Thickness and its source.
 
     Args:
         sidecar: None if there is none.
-        distance_mm: between slices by the header.
+        slice_spacing_mm: between slices by the header.
         given_mm: by the user.
         name: of the image, for messages.
     """
@@ -145,7 +145,7 @@ def _thickness(
                 sidecar.name,
             )
         return given_mm, "option"
-    return (distance_mm, "spacing") if said_mm is None else (said_mm, "sidecar")
+    return (slice_spacing_mm, "spacing") if said_mm is None else (said_mm, "sidecar")
 
 
 def _profile(thickness_mm: float, source: ThicknessSource, sidecar: Sidecar | None, slice_axis: int) -> SliceProfile:

@@ -15,6 +15,7 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 from g3r.geometry.grid import bounding_box
+from g3r.geometry.rigid import orthonormal
 
 MIN_SLICE_PIXELS = 12
 """Fewest masked pixels of a slice. Slices with fewer determine no pose and show little; they are skipped and named in
@@ -33,13 +34,11 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         raise InputError("no stack given; pass at least one")
     rotation, center, spacing, shape, psf = [], [], [], [], []
     values, masks, stack_id, slice_index, thickness = [], [], [], [], []
-    extent, distance, beyond = [], [], []
+    extent, slice_spacing, beyond = [], [], []
     for number, stack in enumerate(stacks):
-        axes = stack.affine[:3, :3] / stack.spacing_mm
         # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
-        frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
-        left, _, right = np.linalg.svd(frame)
-        frame = left @ right
+        frame = orthonormal(stack.grid.plane_frame[None])[0]
+        step_mm = stack.spacing_mm[2] * np.sign(frame[:, 2] @ stack.grid.axes[:, 2])
         used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
         n_beyond = _slices_beyond(stack, used)
         for k in used:
@@ -58,7 +57,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             thickness.append(stack.thickness_mm)
             whole = np.array([(-0.5, n - 0.5) for n in inside.shape]) - np.array(middle[:2])[:, None]
             extent.append(whole * stack.spacing_mm[:2, None])
-            distance.append(stack.spacing_mm[2] * np.sign(frame[:, 2] @ axes[:, 2]))
+            slice_spacing.append(step_mm)
             beyond.append([n_beyond[0] if k == used[0] else 0, n_beyond[1] if k == used[-1] else 0])
     if not rotation:
         raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
@@ -78,7 +77,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         thickness_mm=np.array(thickness),
         header_pose=planes.pose,
         view=FieldsOfView(
-            extent_mm=np.array(extent), spacing_mm=np.array(distance), n_beyond=np.array(beyond, dtype=np.int64)
+            extent_mm=np.array(extent), spacing_mm=np.array(slice_spacing), n_beyond=np.array(beyond, dtype=np.int64)
         ),
     )
 
@@ -128,11 +127,18 @@ def by_headers(slices: Slices, stacks: Sequence[Stack]) -> Slices:
 
 def slice_spacing_mm(stack: Slices) -> float:
     """Median distance between neighbouring slices of one stack by the header; the thickness of a single slice."""
+    return float(np.median(np.abs(steps_along_normal_mm(stack))))
+
+
+def steps_along_normal_mm(stack: Slices) -> NDArray[np.float64]:
+    """Steps [K - 1] from one slice number of a stack to the next along the normal, by the header.
+
+    Negative where the numbers rise against the normal; the thickness of a single slice [1].
+    """
     if len(stack) < 2:
-        return float(stack.thickness_mm[0])
-    normal = stack.header_pose.rotation[0, :, 2]
-    along = stack.header_pose.translation_mm @ normal
-    return float(np.median(np.abs(np.diff(along) / np.diff(stack.slice_index))))
+        return stack.thickness_mm[:1]
+    along = stack.header_pose.translation_mm @ stack.header_pose.rotation[0, :, 2]
+    return np.diff(along) / np.diff(stack.slice_index)
 
 
 def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:

@@ -90,19 +90,18 @@ class Stack:
         if image.shape[2] < 2:
             raise InputError(f"{self.name}: holds {image.shape[2]} slice; expected a stack of at least 2")
         try:
-            spacing = VolumeGrid(image.shape, affine).spacing_mm
+            grid = VolumeGrid(image.shape, affine)
         except ValueError as error:
             raise InputError(f"{self.name}: bad header ({error}); fix the sform or qform") from None
+        spacing, shear = grid.spacing_mm, grid.shear
         low, high = SPACING_RANGE_MM
         if not (low <= spacing.min() and spacing.max() <= high):
             raise InputError(
                 f"{self.name}: voxels of {spaced(spacing)} mm; expected {low:g} to {high:g} mm, check the "
                 "header (units, pixdim, sform)"
             )
-        axes = affine[:3, :3] / spacing
-        cosine = np.abs(axes.T @ axes - np.eye(3)).max()
-        if cosine > ORTHOGONALITY_TOLERANCE:
-            raise InputError(f"{self.name}: axes are sheared (cosine {cosine:.2g}); resample to orthogonal axes")
+        if shear > ORTHOGONALITY_TOLERANCE:
+            raise InputError(f"{self.name}: axes are sheared (cosine {shear:.2g}); resample to orthogonal axes")
         low, high = THICKNESS_RANGE_MM
         if not (np.isfinite(self.thickness_mm) and low <= self.thickness_mm <= high):
             raise InputError(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
 from g3r.run.on_demand import torch
@@ -60,22 +61,20 @@ class TemplateFit:
 
 
 def fit_template(
-    template: NDArray[np.float32],
-    template_grid: VolumeGrid,
+    template: PlacedHead,
     head: NDArray[np.float32],
     share: NDArray[np.float32],
-    seen: NDArray[np.float32],
+    density: NDArray[np.float32],
     grid: VolumeGrid,
     n_steps: tuple[int, int] = (AFFINE_STEPS, DEFORMATION_STEPS),
 ) -> TemplateFit:
     """A template brought to the seen part of a head by an affine map and a smooth deformation.
 
     Args:
-        template: [A, B, C] float32, zero outside the brain, placed roughly on the head.
-        template_grid: its grid.
+        template: placed roughly on the head.
         head: [I, J, K] V_coarse or V_sharp, normalised (bright tissue is of order 1).
         share: [I, J, K] of brain in [0, 1], see `brain_share`.
-        seen: [I, J, K] weight of each voxel, 0 where no slice looked.
+        density: [I, J, K] M_rho, the weight of each voxel up to 1; 0 where no slice looked.
         grid: of the last three and of the result.
         n_steps: of the affine map alone, and of affine map and deformation.
     """
@@ -83,14 +82,13 @@ def fit_template(
     torch.set_num_threads(1)  # steps are so small that more threads wait for each other longer than they work
     try:
         with torch.inference_mode(False), torch.enable_grad():
-            return _fitted(template, template_grid, head * share, share, seen, grid, n_steps)
+            return _fitted(template, head * share, share, np.minimum(density, 1), grid, n_steps)
     finally:
         torch.set_num_threads(n_threads)
 
 
 def _fitted(
-    template: NDArray[np.float32],
-    template_grid: VolumeGrid,
+    template: PlacedHead,
     head: NDArray[np.float32],
     share: NDArray[np.float32],
     seen: NDArray[np.float32],
@@ -102,10 +100,10 @@ def _fitted(
     weight = _reduced(seen, grid, working)
     observed, outline = (_reduced(one * seen, grid, working) / weight.clamp_min(1e-3) for one in (head, share))
     weight = weight.clamp(0, 1)
-    sharp = [template, (template > 0).astype(np.float32)]
-    sigma = BLUR_VOXELS * WORKING_VOXEL_MM / template_grid.spacing_mm
+    sharp = [template.volume, (template.volume > 0).astype(np.float32)]
+    sigma = BLUR_VOXELS * WORKING_VOXEL_MM / template.grid.spacing_mm
     pair = torch.from_numpy(np.stack([gaussian_filter(one, sigma) for one in sharp]))[None]
-    deformation = _Deformation(working, template_grid)
+    deformation = _Deformation(working, template.grid)
     affine_steps, total = n_steps[0], sum(n_steps)
     adams = [_Adam(deformation.affine)]
     loss = torch.zeros(())

@@ -111,7 +111,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a pose cannot be read ({error}); expected rotation and center") from None
     grids = {n: load_volume(folder / f"mask-{n}.nii.gz").grid for n in {stack for stack, _ in keys}}
-    frames = {n: grid.affine[:3, :3] / grid.spacing_mm for n, grid in grids.items()}
+    frames = {n: grid.axes for n, grid in grids.items()}
     # frames may be left-handed, but the motion between two frames of the same hand is still proper
     rotation = np.stack([r @ frames[key[0]].T for key, r in zip(keys, true_frame, strict=True)])
     middle = np.stack(

@@ -180,5 +180,4 @@ class LatticeSpacing:
 
     def mm(self, slices: Slices) -> float:
         """Cell edge per Gaussian for the median pixel of some slices."""
-        covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
-        return min(self.pixels * float(np.median(covered_mm3)) ** (1 / 3), self.at_most_mm)
+        return min(self.pixels * slices.typical_pixel_mm, self.at_most_mm)

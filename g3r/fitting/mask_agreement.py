@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_fill_holes
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coverage import UNSEEN_BELOW, brain_share, coverage
 from g3r.acquisition.planes import Slices
@@ -21,10 +22,8 @@ from g3r.acquisition.stacks import Stack
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box, on_grid
-from g3r.prior.subject_template import PlacedTemplate
 from g3r.registration import Registration
 from g3r.registration.estimate import measured_again
-from g3r.registration.unseen import TemplateFill
 
 REFINED = "automatic"
 """Masks of this source are refined; masks drawn by a person, or made by a tool of the user's, are not."""
@@ -49,7 +48,7 @@ class RefinedMasks:
 
 
 def refine_masks(
-    stacks: Sequence[Stack], registration: Registration, intensity: float, template: PlacedTemplate | None
+    stacks: Sequence[Stack], registration: Registration, intensity: float, template: PlacedHead | None
 ) -> RefinedMasks:
     """Automatic masks, refined by the majority of the mask itself, each of the other stacks and the template.
 
@@ -87,23 +86,15 @@ def refine_masks(
     kept = rows.take(_rows_of(slices, rows)).with_motion(slices.world_from_header())
     poses = replace(registration, slices=kept)
     if any(new is not old for new, old in zip(refined, stacks, strict=True)):
-        poses = measured_again(poses, _fill(template))
+        poses = measured_again(poses, template)
     return RefinedMasks(stacks=refined, poses=poses, notes=notes)
-
-
-def _fill(template: PlacedTemplate | None) -> TemplateFill | None:
-    """The template for what stacks do not show."""
-    if template is None:
-        return None
-    center_mm = template.grid.world(np.argwhere(template.volume > 0)).mean(0)
-    return TemplateFill(template.volume, template.grid, center_mm)
 
 
 def _seen_and_brain(stack: Slices, grid: VolumeGrid) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Where the slices of a stack look [I, J, K], and the masked share of what they see there."""
     density = coverage(stack, grid)
     operator = VoxelOperator(stack.planes, grid, stack.pixel_index)
-    amount = stack.planes.spacing_mm.prod(1) * stack.thickness_mm / grid.voxel_volume_mm3
+    amount = stack.pixel_volume_mm3 / grid.voxel_volume_mm3
     masked = operator.adjoint(amount[operator.plane].astype(np.float32))
     return density > UNSEEN_BELOW, brain_share(masked, density)
 

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.coverage import UNSEEN_BELOW
 from g3r.acquisition.smooth_fill import smooth_fill
+from g3r.acquisition.template_fit import fit_template
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.least_squares_volume import least_squares_volume
 from g3r.prior.maps import PriorMaps, Tiling
-from g3r.prior.subject_template import PlacedTemplate
 from g3r.registration.atlas_frame import Orientation
 
 if TYPE_CHECKING:
@@ -22,11 +23,11 @@ KNOWN_DENSITY = 2 * UNSEEN_BELOW
 """Density from which on the slices' volume is taken unchanged, if no template fills what is missing."""
 
 
-def placed_template(prior: Prior | None, orientation: Orientation | None) -> PlacedTemplate | None:
+def placed_template(prior: Prior | None, orientation: Orientation | None) -> PlacedHead | None:
     """The prior's template in the frame of the slices; None without a prior, or if the slices have another frame."""
     if prior is None or orientation is None or not prior.network.config.use_template:
         return None
-    return PlacedTemplate.of(prior.template, orientation.weeks, orientation.scale)
+    return prior.template.scaled_head(orientation.weeks, orientation.scale)
 
 
 def prior_volume(
@@ -34,7 +35,7 @@ def prior_volume(
     gain: NDArray[np.float64],
     weight: NDArray[np.float64],
     prior: Prior | None,
-    placed: PlacedTemplate | None,
+    placed: PlacedHead | None,
     *,
     n_views: int,
     tiling: Tiling,
@@ -54,7 +55,7 @@ def prior_volume(
     """
     share, seen = volumes.share, volumes.foreground
     if placed is not None:
-        fitted = placed.fitted(volumes.sharp, share, volumes.density, volumes.grid)
+        fitted = fit_template(placed, volumes.sharp, share, volumes.density, volumes.grid)
         guess, outline = fitted.values, fitted.inside
     else:
         mask, support = seen.mask(), seen.support()

@@ -101,8 +101,7 @@ def _shapes(
             smooth = gaussian_filter(gradient[a] * gradient[b], sigma)
             tensor[:, a, b] = tensor[:, b, a] = _sample(smooth, grid, points)
     # gradients are along the grid's axes; a rotation takes them to world axes
-    axes = grid.affine[:3, :3] / grid.spacing_mm
-    tensor = axes @ tensor @ axes.T
+    tensor = grid.axes @ tensor @ grid.axes.T
     energy, vectors = np.linalg.eigh(tensor)
     floor = 0.1 * float(np.mean(strength**2)) + 1e-12
     ratio = (energy + floor) ** -0.25

@@ -85,10 +85,34 @@ class VolumeGrid:
         """The same voxels after a rigid motion of the world (one pose)."""
         return VolumeGrid(self.shape, pose.matrix[0] @ self.affine)
 
+    def scaled_about(self, center_mm: NDArray[np.float64], scale: float) -> VolumeGrid:
+        """The same voxels enlarged by a factor about a point [3] that stays in place."""
+        affine = self.affine.copy()
+        affine[:3, :3] *= scale
+        affine[:3, 3] = center_mm + scale * (self.affine[:3, 3] - center_mm)
+        return VolumeGrid(self.shape, affine)
+
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
         """Distance between neighbouring voxels along each axis [3]."""
         return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0), dtype=np.float64)
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """Unit vectors along the axes in the world, as columns [3, 3]."""
+        return self.affine[:3, :3] / self.spacing_mm
+
+    @property
+    def shear(self) -> float:
+        """Largest cosine between two axes; 0 if they are orthogonal."""
+        axes = self.axes
+        return float(np.abs(axes.T @ axes - np.eye(3)).max())
+
+    @property
+    def plane_frame(self) -> NDArray[np.float64]:
+        """First axis, second axis and their normal as columns [3, 3]; right-handed, whatever the third axis is."""
+        axes = self.axes
+        return np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
 
     @property
     def voxel_volume_mm3(self) -> float:

@@ -199,7 +199,7 @@ def middle_planes(grid: VolumeGrid, mask: NDArray[np.bool_]) -> Planes:
     box = np.argwhere(mask) if mask.any() else np.array([[0, 0, 0], np.array(grid.shape) - 1])
     low_mm, high_mm = grid.world(box.min(0)), grid.world(box.max(0))
     center_mm, size_mm = (low_mm + high_mm) / 2, np.abs(high_mm - low_mm)
-    directions = grid.affine[:3, :3] / grid.spacing_mm
+    directions = grid.axes
     axes = [(1, 2, 0), (0, 2, 1), (0, 1, 2)]
     rotation = np.stack([directions[:, list(one)] for one in axes])
     rotation[:, :, 2] *= np.sign(np.linalg.det(rotation))[:, None]  # a left-handed grid shows the same plane

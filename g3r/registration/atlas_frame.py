@@ -11,10 +11,10 @@ import numpy as np
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
-from g3r.registration.atlas_search import FittedTemplate
-from g3r.registration.pose_sampling import angle_deg, perturbed, rotations_about, uniform_rotations
+from g3r.registration.atlas_search import ScaledTemplate
+from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
 from g3r.registration.segment_search import aligned_to
-from g3r.registration.similarity import SearchPixels, correlation
+from g3r.registration.similarity import SearchPixels, correlation, random_climb
 from g3r.registration.so3_search import N_FOLLOWED_OF_STACK, N_ORIENTATIONS, STACK_DISTANCE_DEG, best_orientations
 from g3r.registration.thresholds import MIN_ATLAS_CORRELATION, MIN_RIVAL_MARGIN
 
@@ -57,7 +57,7 @@ class Orientation:
 
 
 def standard_orientation(
-    slices: Slices, templates: Sequence[FittedTemplate], start: RigidPose, rng: np.random.Generator
+    slices: Slices, templates: Sequence[ScaledTemplate], start: RigidPose, rng: np.random.Generator
 ) -> Orientation | None:
     """Move all slices together so that the head is oriented as an atlas template.
 
@@ -97,7 +97,7 @@ def standard_orientation(
     return Orientation(pose=pose, correlation=best.correlation, weeks=weeks, scale=best.template.scale, rival=rival)
 
 
-def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> Orientation:
+def present_orientation(slices: Slices, templates: Sequence[ScaledTemplate]) -> Orientation:
     """How well slices fit the atlas templates at their present poses.
 
     Args:
@@ -116,11 +116,11 @@ class _Fit:
 
     correlation: float
     motion: RigidPose
-    template: FittedTemplate
+    template: ScaledTemplate
 
 
 def _in_all_orientations(
-    templates: Sequence[FittedTemplate], pixels: SearchPixels, rng: np.random.Generator
+    templates: Sequence[ScaledTemplate], pixels: SearchPixels, rng: np.random.Generator
 ) -> list[_Fit]:
     """Fits of the slices to each template, from the orientations in which they correlate best."""
     rotation = uniform_rotations(N_ORIENTATIONS)
@@ -135,19 +135,15 @@ def _in_all_orientations(
 
 
 def _moved_to(
-    template: FittedTemplate,
+    template: ScaledTemplate,
     pixels: SearchPixels,
     motion: RigidPose,
     rounds: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> _Fit:
     """The best fit of all slices to a template, after some of `ROUNDS`."""
-    agreement = np.zeros(1)
-    for rotation_deg, translation_mm in rounds:
-        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
-        agreement = correlation(pixels.moments(template.volume, template.grid, candidate).sum(1))
-        motion = candidate.take([int(agreement.argmax())])
-    return _Fit(float(agreement.max()), motion, template)
+    motion, highest = random_climb(pixels, template.volume, template.grid, motion, rounds, N_CANDIDATES, rng)
+    return _Fit(highest, motion, template)
 
 
 def centred_on_headers(slices: Slices) -> Slices:

@@ -15,9 +15,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.area_profile import head_volume_mm3
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.planes import Slices
-from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry import RigidPose
 from g3r.registration.held_out import predict
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
@@ -45,8 +45,8 @@ HEADER_PENALTY, HEADER_DEG = 8.0, 25.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class FittedTemplate:
-    """An atlas template of about the subject's age, scaled to its size.
+class ScaledTemplate(PlacedHead):
+    """A head of an atlas template in the atlas frame, of about the subject's age, scaled to its size.
 
     Args:
         volume: [I, J, K] blurred as thick slices are.
@@ -56,9 +56,6 @@ class FittedTemplate:
         scale: by which it was enlarged.
     """
 
-    volume: NDArray[np.float32]
-    grid: VolumeGrid
-    center_mm: NDArray[np.float64]
     weeks: float
     scale: float
 
@@ -74,8 +71,8 @@ class AtlasPlacement:
     """
 
     placement: list[Placement]
-    template: FittedTemplate
-    templates: list[FittedTemplate]
+    template: ScaledTemplate
+    templates: list[ScaledTemplate]
 
     def motion(self, n_slices: int, samples: list[StackSamples]) -> RigidPose:
         """Motions [K] of all slices (world from header)."""
@@ -101,38 +98,38 @@ def place_in_atlas(
     """
     templates = nearest_templates(slices, template)
     few = uniform_rotations(N_ORIENTATIONS // 4)
-    fitted = max(templates, key=lambda one: float(_head_correlation(samples, one, few).max()))
-    bases = template_orientations(samples, fitted)
+    scaled = max(templates, key=lambda one: float(_head_correlation(samples, one, few).max()))
+    bases = template_orientations(samples, scaled)
     # several orientations that fit about as well are a sign that the headers do not hold the stacks together
     by_stack = len(bases) > 1
-    candidates = [_stack_placements(sample, fitted, bases, by_stack, rng) for sample in samples]
+    candidates = [_stack_placements(sample, scaled, bases, by_stack, rng) for sample in samples]
     placement = _consistent(samples, candidates)
     for rotation_deg, translation_mm in REFINEMENT[2:]:
         placement = [
-            _refined(sample, one, fitted, rotation_deg, translation_mm, rng)
+            _refined(sample, one, scaled, rotation_deg, translation_mm, rng)
             for sample, one in zip(samples, placement, strict=True)
         ]
-    return AtlasPlacement(placement, fitted, templates)
+    return AtlasPlacement(placement, scaled, templates)
 
 
 def template_fits(slices: Slices, template: AtlasTemplate) -> bool:
     """Whether some template has about the masked volume; none has if the masks are not brain masks."""
     volume_mm3 = head_volume_mm3(slices)
-    scale = [fitted_template(template, n, volume_mm3).scale for n in range(len(template))]
+    scale = [scaled_template(template, n, volume_mm3).scale for n in range(len(template))]
     fits = any(SCALE_RANGE[0] <= s <= SCALE_RANGE[1] for s in scale)
     if not fits:
         logger.info("masked volume of %.0f ml: no atlas template of that size", volume_mm3 / 1000)
     return fits
 
 
-def nearest_templates(slices: Slices, template: AtlasTemplate) -> list[FittedTemplate]:
+def nearest_templates(slices: Slices, template: AtlasTemplate) -> list[ScaledTemplate]:
     """The three templates nearest to the subject's size, scaled to it."""
     volume_mm3 = head_volume_mm3(slices)
-    candidates = [fitted_template(template, n, volume_mm3) for n in range(len(template))]
+    candidates = [scaled_template(template, n, volume_mm3) for n in range(len(template))]
     return sorted(candidates, key=lambda one: abs(np.log(one.scale)))[:3]
 
 
-def fitted_template(template: AtlasTemplate, number: int, volume_mm3: float) -> FittedTemplate:
+def scaled_template(template: AtlasTemplate, number: int, volume_mm3: float) -> ScaledTemplate:
     """One template scaled about its centre to a volume.
 
     Args:
@@ -140,31 +137,26 @@ def fitted_template(template: AtlasTemplate, number: int, volume_mm3: float) -> 
         number: which of them.
         volume_mm3: of the subject's head.
     """
-    volume, grid = template.volume[number], template.grid
-    inside = np.argwhere(volume > 0)
-    center = grid.world(inside).mean(0)
-    scale = float((volume_mm3 / (len(inside) * grid.voxel_volume_mm3)) ** (1 / 3))
-    affine = grid.affine.copy()
-    affine[:3, :3] *= scale
-    affine[:3, 3] = center + scale * (grid.affine[:3, 3] - center)
-    return FittedTemplate(
-        volume=gaussian_filter(volume, TEMPLATE_BLUR_VOXELS),
-        grid=VolumeGrid(grid.shape, affine),
-        center_mm=center,
+    head = template.head(number)
+    scale = float((volume_mm3 / (np.count_nonzero(head.volume > 0) * head.grid.voxel_volume_mm3)) ** (1 / 3))
+    return ScaledTemplate(
+        volume=gaussian_filter(head.volume, TEMPLATE_BLUR_VOXELS),
+        grid=head.grid.scaled_about(head.center_mm, scale),
+        center_mm=head.center_mm,
         weeks=float(template.weeks[number]),
         scale=scale,
     )
 
 
-def template_orientations(samples: list[StackSamples], fitted: FittedTemplate) -> list[NDArray[np.float64]]:
+def template_orientations(samples: list[StackSamples], scaled: ScaledTemplate) -> list[NDArray[np.float64]]:
     """Orientations [3, 3] of the whole head worth following, best first."""
     rotation = uniform_rotations(N_ORIENTATIONS)
-    agreement = _head_correlation(samples, fitted, rotation)
+    agreement = _head_correlation(samples, scaled, rotation)
     chosen = best_orientations(rotation, agreement)
     logger.info(
         "atlas template of %.0f weeks, scaled by %.2f: correlation %.2f, %d orientations to follow",
-        fitted.weeks,
-        fitted.scale,
+        scaled.weeks,
+        scaled.scale,
         agreement.max(),
         len(chosen),
     )
@@ -172,37 +164,37 @@ def template_orientations(samples: list[StackSamples], fitted: FittedTemplate) -
 
 
 def _head_correlation(
-    samples: list[StackSamples], fitted: FittedTemplate, rotation: NDArray[np.float64]
+    samples: list[StackSamples], scaled: ScaledTemplate, rotation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Correlation [J] of all stacks with a template, each stack rotated about its own centre."""
     total = np.zeros((len(rotation), 6))
     for sample in samples:
-        motion = rotations_about(rotation, sample.pixels.center_mm, fitted.center_mm)
-        total += sample.pixels.moments(fitted.volume, fitted.grid, motion, nearest=True).sum(1)
+        motion = rotations_about(rotation, sample.pixels.center_mm, scaled.center_mm)
+        total += sample.pixels.moments(scaled.volume, scaled.grid, motion, nearest=True).sum(1)
     return correlation(total)
 
 
 def _stack_placements(
     sample: StackSamples,
-    fitted: FittedTemplate,
+    scaled: ScaledTemplate,
     bases: list[NDArray[np.float64]],
     by_stack: bool,
     rng: np.random.Generator,
 ) -> list[tuple[float, Placement]]:
     """Placements of one stack around several orientations, with their costs, cheapest first."""
     if by_stack:
-        own = stack_orientations(sample, fitted.center_mm, fitted.volume, fitted.grid)
+        own = stack_orientations(sample, scaled.center_mm, scaled.volume, scaled.grid)
         bases = bases + [base for base in own if min(angle_deg(base, other) for other in bases) > SAME_DEG]
     found = []
     for base in bases:
-        one = place_around(sample, base, fitted.center_mm, fitted.volume, fitted.grid)
-        found.append((_cost(sample, one, fitted), one))
+        one = place_around(sample, base, scaled.center_mm, scaled.volume, scaled.grid)
+        found.append((_cost(sample, one, scaled), one))
     found.sort(key=lambda candidate: candidate[0])
     refined = []
     for _, one in found[:N_PLACEMENTS]:
         for rotation_deg, translation_mm in REFINEMENT[:2]:
-            one = _refined(sample, one, fitted, rotation_deg, translation_mm, rng)
-        refined.append((_cost(sample, one, fitted), one))
+            one = _refined(sample, one, scaled, rotation_deg, translation_mm, rng)
+        refined.append((_cost(sample, one, scaled), one))
     return sorted(refined, key=lambda candidate: candidate[0])
 
 
@@ -236,14 +228,14 @@ def _header_penalty(mean: list[list[NDArray[np.float64]]], choice: list[int], st
     return float(HEADER_PENALTY * np.log1p((angles / HEADER_DEG) ** 2).sum())
 
 
-def _cost(sample: StackSamples, one: Placement, fitted: FittedTemplate) -> float:
-    return predict(sample, one.motion, fitted.volume, fitted.grid, one.segments.interleave).cost
+def _cost(sample: StackSamples, one: Placement, scaled: ScaledTemplate) -> float:
+    return predict(sample, one.motion, scaled.volume, scaled.grid, one.segments.interleave).cost
 
 
 def _refined(
     sample: StackSamples,
     one: Placement,
-    fitted: FittedTemplate,
+    scaled: ScaledTemplate,
     rotation_deg: float,
     translation_mm: float,
     rng: np.random.Generator,
@@ -251,8 +243,8 @@ def _refined(
     return refine_placement(
         sample,
         one.motion,
-        fitted.volume,
-        fitted.grid,
+        scaled.volume,
+        scaled.grid,
         rotation_deg=rotation_deg,
         translation_mm=translation_mm,
         rng=rng,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.area_profile import AreaProfile
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, centred_on_headers, standard_orientation
@@ -18,9 +18,9 @@ from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.handedness import handedness
-from g3r.registration.held_out import estimate_interleave, held_out_score
+from g3r.registration.held_out import held_out_score
 from g3r.registration.intruder import misfit_without_each
-from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time, estimate_interleave
 from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
@@ -29,7 +29,6 @@ from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, fitted_in_place, refine_slices
 from g3r.registration.stack_quality import StackQuality
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
-from g3r.registration.unseen import TemplateFill
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -107,8 +106,7 @@ def register(
         deadline: search and rounds are shortened to end by then, if they can.
     """
     given, slices = slices, bias_corrected(slices)
-    covered_mm3 = float(np.median(slices.planes.spacing_mm.prod(1) * slices.thickness_mm))
-    least_mm = settings.finest_voxel_pixels * covered_mm3 ** (1 / 3)
+    least_mm = settings.finest_voxel_pixels * slices.typical_pixel_mm
     settings = replace(settings, finest_voxel_mm=max(settings.finest_voxel_mm, least_mm))
     samples = StackSamples.of_all(slices, settings.n_candidates)
     single = len(samples) == 1
@@ -160,7 +158,7 @@ def register(
     )
 
 
-def measured_again(registration: Registration, fill: TemplateFill | None = None) -> Registration:
+def measured_again(registration: Registration, fill: PlacedHead | None = None) -> Registration:
     """The registration with its measures of quality computed anew, for slices with other masks.
 
     Args:
@@ -260,7 +258,7 @@ def segments_of(
     n_segments, interleave = [], list[int | None]()
     for sample in samples:
         own = motion.take(sample.rows)
-        order = estimate_interleave(sample, own)
+        order = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
         moves = changes_in_time(own, sample.slice_index, sample.pixels.center_mm, order)
         n_segments.append(1 + int((moves > same_mm).sum()))
         interleave.append(order if n_segments[-1] > 1 else None)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
@@ -22,7 +22,6 @@ from g3r.registration.overlap import overlap_of
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import fitted_in_place
-from g3r.registration.unseen import TemplateFill
 
 logger = logging.getLogger(__name__)
 
@@ -148,9 +147,8 @@ def _orientation(
     return placed, found
 
 
-def _fill(placed: AtlasPlacement | None, orientation: Orientation | None) -> TemplateFill | None:
+def _fill(placed: AtlasPlacement | None, orientation: Orientation | None) -> PlacedHead | None:
     """The template that stands for what stacks lack, if the slices are in its frame."""
     if placed is None or orientation is None:
         return None
-    head = next(one for one in placed.templates if one.weeks == orientation.weeks)
-    return TemplateFill(head.volume, head.grid, head.center_mm)
+    return next(one for one in placed.templates if one.weeks == orientation.weeks)

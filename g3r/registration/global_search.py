@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.atlas_search import AtlasPlacement, place_in_atlas
@@ -24,7 +24,7 @@ from g3r.registration.thresholds import (
     MIN_SINGLE_GAIN_PER_SAMPLE,
     RETRY_BELOW_CORRELATION,
 )
-from g3r.registration.unseen import TemplateFill, with_header_spans
+from g3r.registration.unseen import with_header_spans
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class SearchResult:
     initialisation: str
     initialisations: dict[str, list[float]]
     placed: AtlasPlacement | None
-    fill: TemplateFill | None = None
+    fill: PlacedHead | None = None
     score: HeldOutScore | None = None
 
 
@@ -102,7 +102,7 @@ class GlobalSearch:
             in_atlas = placed.motion(len(slices), samples)
             if any(sample.profile.has_missing for sample in samples):
                 # the template stands for what is missing, so every initialisation has to be in its frame
-                fill = TemplateFill(placed.template.volume, placed.template.grid, placed.template.center_mm)
+                fill = placed.template
                 initialisations = {
                     name: aligned_to(slices, in_atlas, motion) for name, motion in initialisations.items()
                 }

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import mean
 
 import numpy as np
@@ -22,8 +22,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.held_out import fine_volume_without
 from g3r.registration.normal_equations import SampledSlices
-from g3r.registration.pose_sampling import perturbed
-from g3r.registration.similarity import SearchPixels, correlation
+from g3r.registration.similarity import SearchPixels, random_climb
 from g3r.registration.slice_registration import register_slices
 from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, STANDS_APART, STANDS_OUT
 
@@ -80,9 +79,8 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
         stacks, one is called a mirror image only if the others show that the head is asymmetric (`_stands_out`). With
         two stacks there is no such check, and a symmetric head may be below the limit by shading alone.
     """
-    value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
-    evened, rng = replace(slices, value=value), np.random.default_rng(seed)
-    found = [None if one is None else one.highest for one in _of_all(evened, rng).values()]
+    asymmetry = _of_all(slices.without_gain(gain), np.random.default_rng(seed))
+    found = [None if one is None else one.highest for one in asymmetry.values()]
     logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found))
     return found
 
@@ -132,10 +130,8 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry
 
 def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator) -> Slices:
     """The slices of a stack after the one rigid motion that fits them best to a volume."""
-    pixels, motion = SearchPixels.of(own, PIXELS_PER_SLICE), RigidPose.identity(1)
-    for rotation_deg, translation_mm in ROUNDS:
-        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
-        motion = candidate.take([int(correlation(pixels.moments(volume, grid, candidate).sum(1)).argmax())])
+    pixels = SearchPixels.of(own, PIXELS_PER_SLICE)
+    motion, _ = random_climb(pixels, volume, grid, RigidPose.identity(1), ROUNDS, N_CANDIDATES, rng)
     return own.with_pose(motion.take(np.zeros(len(own), int)) @ own.planes.pose)
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.motion_segments import changes_in_time, time_orders, transition_penalty
+from g3r.registration.motion_segments import changes_in_time, estimate_interleave, transition_penalty
 from g3r.registration.similarity import (
     CORRELATION_AREA_MM2,
     StackSamples,
@@ -24,7 +25,7 @@ from g3r.registration.similarity import (
     own_moments,
 )
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
-from g3r.registration.unseen import TemplateFill, coverage_share
+from g3r.registration.unseen import coverage_share, filled_with_head, grid_with_head
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +49,7 @@ PIXELS_OF_VOLUME = 100_000
 
 
 def volume_without(
-    slices: Slices, stack: int, spacing_mm: float, fill: TemplateFill | None = None
+    slices: Slices, stack: int, spacing_mm: float, fill: PlacedHead | None = None
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
     """A volume from all slices except those of one stack, zero outside the masks; and its grid.
 
@@ -64,7 +65,7 @@ def volume_without(
     weight = np.ones(len(value), np.float32)
     volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
     if fill is not None:
-        volume = fill.filled(volume, grid, operator.adjoint(weight))
+        volume = filled_with_head(volume, grid, operator.adjoint(weight), fill)
     return gaussian_filter(volume, 0.5), grid
 
 
@@ -81,13 +82,13 @@ def coverage_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDA
 
 
 def _of_others(
-    slices: Slices, stack: int, spacing_mm: float, fill: TemplateFill | None, n_pixels: int = PIXELS_OF_VOLUME
+    slices: Slices, stack: int, spacing_mm: float, fill: PlacedHead | None, n_pixels: int = PIXELS_OF_VOLUME
 ) -> tuple[VoxelOperator, NDArray[np.float32], VolumeGrid]:
     """Operator and values of some pixels of all other stacks, pixels outside the masks included."""
     others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
     if fill is not None:
-        grid = fill.grid_with(grid)
+        grid = grid_with_head(grid, fill)
     index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // n_pixels))
     is_thin = float(others.planes.psf_var_mm2[:, 2].max()) < THIN_VARIANCE * spacing_mm**2
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 1 if is_thin else 3))
@@ -174,7 +175,7 @@ class HeldOutScore:
 
 
 def held_out_score(
-    slices: Slices, samples: list[StackSamples], motion: RigidPose, fill: TemplateFill | None = None
+    slices: Slices, samples: list[StackSamples], motion: RigidPose, fill: PlacedHead | None = None
 ) -> HeldOutScore:
     """Hold out each stack in turn and compare it with the volume of the others.
 
@@ -189,7 +190,8 @@ def held_out_score(
     for sample in samples:
         volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM, fill)
         own = motion.take(sample.rows)
-        predictions.append(predict(sample, own, volume, grid, estimate_interleave(sample, own)))
+        interleave = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
+        predictions.append(predict(sample, own, volume, grid, interleave))
     return HeldOutScore(predictions)
 
 
@@ -219,8 +221,7 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     Returns:
         The correlation of each stack; 0 where the others saw nothing of it.
     """
-    value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
-    evened = replace(slices, value=value)
+    evened = slices.without_gain(gain)
     found = []
     for stack in np.unique(slices.stack_id):
         volume, share, grid = fine_volume_without(evened, stack)
@@ -234,20 +235,11 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     return found
 
 
-def estimate_interleave(sample: StackSamples, motion: RigidPose) -> int:
-    """The interleave under which a stack's motions [K] change least."""
-    penalties = {
-        n: transition_penalty(changes_in_time(motion, sample.slice_index, sample.pixels.center_mm, n))
-        for n in time_orders(sample.slice_index)
-    }
-    return min(penalties, key=lambda n: penalties[n])
-
-
 def best_initialisation(
     slices: Slices,
     samples: list[StackSamples],
     initialisations: Mapping[str, RigidPose],
-    fill: TemplateFill | None = None,
+    fill: PlacedHead | None = None,
 ) -> tuple[str, dict[str, HeldOutScore]]:
     """The name of the initialisation with the lowest held-out cost, and the scores of all.
 

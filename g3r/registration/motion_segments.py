@@ -72,8 +72,6 @@ def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
 def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distance [A, B] between where motions a and b take a ball of `HEAD_RADIUS_MM`.
 
-    For a ball of radius r about the center, mean |(R_a - R_b) x|^2 = 2 (3 - trace(R_a^T R_b)) r^2 / 5.
-
     Args:
         a: A motions.
         b: B motions.
@@ -83,7 +81,19 @@ def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64])
     place_b = b.rotation @ center_mm + b.translation_mm
     translation = ((place_a[:, None] - place_b[None]) ** 2).sum(-1)
     trace = np.einsum("aij,bij->ab", a.rotation, b.rotation, optimize=True)
-    return np.sqrt(translation + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
+    return _ball_distance_mm(translation, trace)
+
+
+def _ball_distance_mm(translation_mm2: NDArray[np.float64], trace: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean square distance [...] between the places of a ball of `HEAD_RADIUS_MM` under two motions.
+
+    For a ball of radius r about the centre, mean |(R_a - R_b) x|^2 = 2 (3 - trace(R_a^T R_b)) r^2 / 5.
+
+    Args:
+        translation_mm2: [...] squared distance between the two places of its centre.
+        trace: [...] of R_a^T R_b.
+    """
+    return np.sqrt(translation_mm2 + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
 
 
 def best_segments(
@@ -149,12 +159,26 @@ def changes_in_time(
     place = ordered.rotation @ center_mm + ordered.translation_mm
     translation = (np.diff(place, axis=0) ** 2).sum(1)
     trace = np.einsum("tij,tij->t", ordered.rotation[:-1], ordered.rotation[1:])
-    return np.sqrt(translation + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
+    return _ball_distance_mm(translation, trace)
 
 
 def transition_penalty(distance_mm: NDArray[np.float64]) -> float:
     """Penalty of all movements [K - 1] (mm) of a stack; no movement costs nothing."""
     return float(_penalty(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
+
+
+def estimate_interleave(motion: RigidPose, slice_index: NDArray[np.int64], center_mm: NDArray[np.float64]) -> int:
+    """The interleave under which the motions of a stack change least.
+
+    Args:
+        motion: [K] world from header.
+        slice_index: [K] numbers of the slices in their stack.
+        center_mm: [3] centre of the head before the motions.
+    """
+    penalties = {
+        n: transition_penalty(changes_in_time(motion, slice_index, center_mm, n)) for n in time_orders(slice_index)
+    }
+    return min(penalties, key=lambda n: penalties[n])
 
 
 def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -7,24 +7,18 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import fit_rigid_robust
-from g3r.registration.held_out import (
-    HELD_OUT_VOXEL_MM,
-    HeldOutScore,
-    estimate_interleave,
-    held_out_score,
-    predict,
-    volume_without,
-)
+from g3r.registration.held_out import HELD_OUT_VOXEL_MM, HeldOutScore, held_out_score, predict, volume_without
+from g3r.registration.motion_segments import estimate_interleave
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.similarity import StackSamples
 from g3r.registration.so3_search import place_around, stack_orientations
 from g3r.registration.stack_registration import refine_stack
 from g3r.registration.thresholds import IN_PLACE_CORRELATION, MIN_COST_GAIN
-from g3r.registration.unseen import TemplateFill
 from g3r.run.deadline import Deadline, timed_steps
 
 logger = logging.getLogger(__name__)
@@ -72,7 +66,7 @@ def refine_segments(
     others: list[RigidPose],
     rng: np.random.Generator,
     deadline: Deadline | None = None,
-    fill: TemplateFill | None = None,
+    fill: PlacedHead | None = None,
     known: HeldOutScore | None = None,
 ) -> tuple[RigidPose, list[Placement]]:
     """Place the motion segments of every stack in the volume of the other stacks, round after round.
@@ -124,7 +118,7 @@ def refine_segments(
 
 
 def _search_orientations(
-    slices: Slices, sample: StackSamples, motion: RigidPose, rng: np.random.Generator, fill: TemplateFill | None
+    slices: Slices, sample: StackSamples, motion: RigidPose, rng: np.random.Generator, fill: PlacedHead | None
 ) -> RigidPose | None:
     """Better motions [K] of one stack than the present ones, from an exhaustive search; None if there are none.
 
@@ -137,7 +131,8 @@ def _search_orientations(
     if fill is not None:  # the others' pixels may lie at one side of the head
         target = fill.center_mm
     own = motion.take(sample.rows)
-    present = predict(sample, own, volume, grid, estimate_interleave(sample, own))
+    interleave = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
+    present = predict(sample, own, volume, grid, interleave)
     if present.correlation > IN_PLACE_CORRELATION:
         return None
     best, cost = None, present.cost
@@ -159,7 +154,7 @@ def collapse_to_rigid(
     samples: list[StackSamples],
     motion: RigidPose,
     interleave: list[int],
-    fill: TemplateFill | None = None,
+    fill: PlacedHead | None = None,
 ) -> RigidPose:
     """Motions [K] with one motion for all slices of a stack where that predicts the stack as well.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.area_profile import AreaProfile, area_profiles
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.pose_sampling import perturbed
 from g3r.registration.similarity_kernels import model_sums
 
 PIXELS_PER_SLICE = 100
@@ -60,7 +62,7 @@ class SearchPixels:
             point_mm=point,
             value=np.where(mask, slices.value[index], 0).astype(np.float32),
             start=np.concatenate([[0], np.cumsum([len(c) for c in chosen])]).astype(np.int64),
-            area_mm2=planes.shape.prod(1) * planes.spacing_mm.prod(1),
+            area_mm2=planes.shape.prod(1) * planes.pixel_area_mm2,
             center_mm=point[mask].mean(0) if mask.any() else point.mean(0),
         )
 
@@ -160,8 +162,8 @@ def slice_costs(
 ) -> NDArray[np.float64]:
     """Negative log likelihood [K, J] of slices k in a volume under motions j.
 
-    Of Student's t form with the noise level of a slice that fits, so that a slice with signal loss counts less. The
-    volume is interpolated to half the voxel size and read at the nearest voxel.
+    The noise is that of a slice that fits (`student_cost`). The volume is interpolated to half the voxel size and read
+    at the nearest voxel.
 
     Args:
         pixels: of K slices.
@@ -171,7 +173,18 @@ def slice_costs(
     """
     residual = mean_square_residual(pixels.moments(*halved_voxels(volume, grid), motion, nearest=True)).T
     noise = float(np.median(residual.min(1))) + 1e-12
-    n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
+    return student_cost(residual, noise, pixels.area_mm2)
+
+
+def student_cost(residual: NDArray[np.float64], noise: float, area_mm2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Negative log likelihood [K, J] of Student's t form, so that a slice with signal loss counts less.
+
+    Args:
+        residual: [K, J] mean square residual of slices k under motions j.
+        noise: mean square residual of a slice that fits.
+        area_mm2: [K] of the slices.
+    """
+    n_samples = area_mm2 / CORRELATION_AREA_MM2
     return n_samples[:, None] * np.log1p(residual / (2 * noise))
 
 
@@ -222,8 +235,45 @@ def correlation(moments: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(defined, (ym - y * m / n) / np.sqrt(np.where(defined, product, 1.0)), 0.0)
 
 
+def random_climb(
+    pixels: SearchPixels,
+    volume: NDArray[np.float32],
+    grid: VolumeGrid,
+    motion: RigidPose,
+    rounds: Sequence[tuple[float, float]],
+    n_candidates: int,
+    rng: np.random.Generator,
+) -> tuple[RigidPose, float]:
+    """The motion [1] that fits all slices together best to a volume, by random steps from the best so far.
+
+    Args:
+        pixels: of K slices.
+        volume: [I, J, K].
+        grid: its grid.
+        motion: [1] to start from.
+        rounds: standard deviations of random rotations (degrees) and translations (mm), round by round.
+        n_candidates: random motions in each round.
+        rng: source of randomness.
+
+    Returns:
+        The motion, and the correlation of all pixels under it.
+    """
+    agreement = np.zeros(1)
+    for rotation_deg, translation_mm in rounds:
+        candidate = perturbed(motion, pixels.center_mm, n_candidates, rotation_deg, translation_mm, rng)
+        agreement = correlation(pixels.moments(volume, grid, candidate).sum(1))
+        motion = candidate.take([int(agreement.argmax())])
+    return motion, float(agreement.max())
+
+
 def mean_square_residual(moments: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of (y - g m)^2 [...] at the best gain g in `GAIN_RANGE`, from moments [..., 6]."""
     n, _, _, yy, mm, ym = np.moveaxis(moments, -1, 0)
-    gain = np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE)
+    gain = best_gain(moments, GAIN_RANGE)
     return np.maximum(yy - 2 * gain * ym + gain**2 * mm, 0.0) / np.maximum(n, 1.0)
+
+
+def best_gain(moments: NDArray[np.float64], gain_range: tuple[float, float]) -> NDArray[np.float64]:
+    """The gain g [...] in a range with the least sum of (y - g m)^2, from moments [..., 6]."""
+    _, _, _, yy, mm, ym = np.moveaxis(moments, -1, 0)
+    return np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *gain_range)

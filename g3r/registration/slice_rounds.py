@@ -18,6 +18,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.settings import RegistrationSettings
+from g3r.registration.similarity import best_gain
 from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
 from g3r.run.deadline import Deadline, timed_steps
@@ -198,8 +199,7 @@ def fitted_in_place(
         model = SampledSlices(slices, volume, grid, stride=stride)
         width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
         fit = model.evaluate(slices.planes, gain, width)
-        yy, mm, ym = fit.moments[:, 3:].T
-        log_gain = np.log(np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE_IN_PLACE))
+        log_gain = np.log(best_gain(fit.moments, GAIN_RANGE_IN_PLACE))
         gain = np.exp(log_gain - log_gain.mean())
         fit = model.evaluate(slices.planes, gain, width)
         weight = slice_weights(fit.loss, gain, slices.n_stacks)

@@ -18,7 +18,8 @@ from g3r.acquisition.robust import robust_width
 from g3r.acquisition.smooth_fill import smooth_fill
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.grid import bounding_box, on_grid
-from g3r.registration.held_out import HELD_OUT_VOXEL_MM, estimate_interleave, predict
+from g3r.registration.held_out import HELD_OUT_VOXEL_MM, predict
+from g3r.registration.motion_segments import estimate_interleave
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.placement import refine_placement
 from g3r.registration.similarity import StackSamples
@@ -89,7 +90,8 @@ def _searched(
                 sample, motion, volume, grid, rotation_deg=rotation_deg, translation_mm=translation_mm, rng=rng
             )
             motion = placement.motion
-        found = predict(sample, motion, volume, grid, estimate_interleave(sample, motion))
+        interleave = estimate_interleave(motion, sample.slice_index, sample.pixels.center_mm)
+        found = predict(sample, motion, volume, grid, interleave)
         logger.debug("a start: cost %.0f, correlation %.2f", found.cost, found.correlation)
         if best is None or found.cost < best[0]:
             best = found.cost, found.correlation, motion

@@ -20,15 +20,15 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import DARK, DROPPED_WEIGHT
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.motion_segments import (
-    changes_in_time,
-    cheapest_path,
-    time_orders,
-    transition_penalties,
-    transition_penalty,
-)
+from g3r.registration.motion_segments import cheapest_path, estimate_interleave, time_orders, transition_penalties
 from g3r.registration.pose_sampling import distinct, perturbed
-from g3r.registration.similarity import CORRELATION_AREA_MM2, SearchPixels, mean_square_residual, own_moments
+from g3r.registration.similarity import (
+    CORRELATION_AREA_MM2,
+    SearchPixels,
+    mean_square_residual,
+    own_moments,
+    student_cost,
+)
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 
 logger = logging.getLogger(__name__)
@@ -138,12 +138,11 @@ class _Search:
         self.volume, self.grid, self.noise, self.center_mm = volume, grid, noise, center_mm
 
     def costs(self, rows: NDArray[np.int64], motion: RigidPose) -> NDArray[np.float64]:
-        """Negative log likelihood [S, J] of slices under motions, as in `similarity.slice_costs`."""
+        """Negative log likelihood [S, J] of slices under motions (`student_cost`)."""
         own = self.slices.take(rows)
         pixels = SearchPixels.of(own.with_pose(own.header_pose))
         residual = mean_square_residual(pixels.moments(self.volume, self.grid, motion)).T
-        n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
-        return n_samples[:, None] * np.log1p(residual / (2 * self.noise))
+        return student_cost(residual, self.noise, pixels.area_mm2)
 
     def of_stack(
         self,
@@ -162,7 +161,8 @@ class _Search:
             known: motions of slices that fit.
             rng: source of random motions.
         """
-        order = self._order_in_time(rows, motion)
+        index = self.slices.slice_index[rows]
+        order = time_orders(index)[estimate_interleave(motion, index, self.center_mm)]
         wanted = np.flatnonzero(astray)
         found, n_each = known, max(1, N_FIRST // len(known))
         for (rotation_deg, translation_mm), n_kept in zip(STEPS, N_KEPT, strict=True):
@@ -183,12 +183,6 @@ class _Search:
         for k, gain in zip(wanted, gained, strict=True):
             logger.debug("slice %d: another place is cheaper by %.0f", rows[k], gain)
         return motion.with_rows(moved, candidate.take(choice[moved])), len(moved)
-
-    def _order_in_time(self, rows: NDArray[np.int64], motion: RigidPose) -> NDArray[np.int64]:
-        index = self.slices.slice_index[rows]
-        orders = time_orders(index)
-        penalty = {n: transition_penalty(changes_in_time(motion, index, self.center_mm, n)) for n in orders}
-        return orders[min(penalty, key=lambda n: penalty[n])]
 
 
 def _volume_of_others(

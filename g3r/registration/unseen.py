@@ -7,12 +7,11 @@ in, predicts roughly what lies there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.grid import on_grid
 
@@ -23,44 +22,32 @@ SPAN_SLICES = 4
 """Slices on either side of a missing span whose mean places give its length; even, for interleaved stacks."""
 
 
-@dataclass(frozen=True)
-class TemplateFill:
-    """An atlas template in the frame of the slices.
+def grid_with_head(grid: VolumeGrid, head: PlacedHead) -> VolumeGrid:
+    """A grid with the voxels of another one that covers it and a whole head."""
+    low, high = head.box_mm()
+    corners = grid.world(grid.corner_index)
+    spacing_mm = float(grid.spacing_mm[0])
+    return VolumeGrid.isotropic(np.minimum(low, corners.min(0)), np.maximum(high, corners.max(0)), spacing_mm)
+
+
+def filled_with_head(
+    volume: NDArray[np.float32], grid: VolumeGrid, coverage: NDArray[np.float32], head: PlacedHead
+) -> NDArray[np.float32]:
+    """A volume with the template where no pixel was seen.
 
     Args:
-        volume: [I, J, K] blurred as thick slices are.
+        volume: [I, J, K] of some slices.
         grid: its grid.
-        center_mm: [3] of the head.
+        coverage: [I, J, K] pixels of those slices (outside the head, too), spread by the PSF.
+        head: of the template, in the frame of the slices.
     """
-
-    volume: NDArray[np.float32]
-    grid: VolumeGrid
-    center_mm: NDArray[np.float64]
-
-    def grid_with(self, grid: VolumeGrid) -> VolumeGrid:
-        """A grid with the voxels of another one that covers it and the whole head."""
-        head = self.grid.world(np.argwhere(self.volume > 0))
-        corners = grid.world(grid.corner_index)
-        both = np.concatenate([head, corners])
-        return VolumeGrid.isotropic(both.min(0), both.max(0), float(grid.spacing_mm[0]), 0.0)
-
-    def filled(
-        self, volume: NDArray[np.float32], grid: VolumeGrid, coverage: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """A volume with the template where no pixel was seen.
-
-        Args:
-            volume: [I, J, K] of some slices.
-            grid: its grid.
-            coverage: [I, J, K] pixels of those slices (outside the head, too), spread by the PSF.
-        """
-        head = on_grid(self.volume, self.grid, grid, 0.0)
-        share = coverage_share(coverage)
-        known = (share >= 1) & (head > 0)
-        scale = 1.0
-        if known.any():
-            scale = float(np.clip((volume[known] @ head[known]) / (head[known] @ head[known]), 0.5, 2.0))
-        return (share * volume + (1 - share) * np.float32(scale) * head).astype(np.float32)
+    template = on_grid(head.volume, head.grid, grid, 0.0)
+    share = coverage_share(coverage)
+    known = (share >= 1) & (template > 0)
+    scale = 1.0
+    if known.any():
+        scale = float(np.clip((volume[known] @ template[known]) / (template[known] @ template[known]), 0.5, 2.0))
+    return (share * volume + (1 - share) * np.float32(scale) * template).astype(np.float32)
 
 
 def coverage_share(coverage: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -60,8 +60,7 @@ def target_grid(
         run_from_space = found
     if like is not None:
         written, evaluated = like.grid, like.grid.moved(run_from_space)
-        axes = like.affine[:3, :3] / written.spacing_mm
-        if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-6:
+        if written.shear > 1e-6:
             raise InputError(f"{like.name}: its axes are sheared; pass an image with orthogonal axes")
     else:
         resolution_mm = float(run.geometry.grid.spacing_mm[0]) if resolution_mm is None else resolution_mm

@@ -15,6 +15,7 @@ from g3r.acquisition.images import Volume, load_volume, read_mask
 from g3r.acquisition.nifti import NO_ORIENTATION
 from g3r.acquisition.stacks import ORTHOGONALITY_TOLERANCE, SPACING_RANGE_MM, spaced
 from g3r.errors import InputError
+from g3r.geometry import VolumeGrid
 from g3r.geometry.rigid import orthonormal
 
 INDEX_NAME = "index.tsv"
@@ -56,8 +57,7 @@ class SliceFile:
     @cached_property
     def rotation(self) -> NDArray[np.float64]:
         """Columns are in-plane x, in-plane y, normal [3, 3]; right-handed, whatever the third axis of the file."""
-        x, y = (self.affine[:3, :2] / self.spacing_mm[:2]).T
-        return orthonormal(np.stack([x, y, np.cross(x, y)], axis=1)[None])[0]
+        return orthonormal(VolumeGrid((*self.image.shape, 1), self.affine).plane_frame[None])[0]
 
     @cached_property
     def center_mm(self) -> NDArray[np.float64]:
@@ -164,11 +164,9 @@ def _check_geometry(volume: Volume) -> None:
         raise InputError(
             f"{name}: pixels and thickness of {spaced(spacing)} mm; expected {low:g} to {high:g} mm, check the header"
         )
-    axes = volume.affine[:3, :3] / spacing
-    cosine = np.abs(axes.T @ axes - np.eye(3)).max()
-    if cosine > ORTHOGONALITY_TOLERANCE:
+    if volume.grid.shear > ORTHOGONALITY_TOLERANCE:
         raise InputError(
-            f"{name}: axes are sheared (cosine {cosine:.2g}); expected a rigid pose, write an affine with "
+            f"{name}: axes are sheared (cosine {volume.grid.shear:.2g}); expected a rigid pose, write an affine with "
             "orthogonal axes"
         )
 

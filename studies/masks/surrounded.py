@@ -170,10 +170,8 @@ def _widened(stack: Stack) -> Stack:
 def _slice_poses(stack: Stack) -> RigidPose:
     """Slice poses by the header: the centre of each slice's pixel grid, and its axes."""
     n_i, n_j, n_slices = stack.image.shape
-    axes = stack.affine[:3, :3] / stack.spacing_mm
-    frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
     index = np.stack([np.full(n_slices, (n_i - 1) / 2), np.full(n_slices, (n_j - 1) / 2), np.arange(n_slices)], axis=1)
-    return RigidPose(np.broadcast_to(frame, (n_slices, 3, 3)), stack.grid.world(index))
+    return RigidPose(np.broadcast_to(stack.grid.plane_frame, (n_slices, 3, 3)), stack.grid.world(index))
 
 
 def _intensities(

@@ -62,7 +62,7 @@ def least_squares_volume(
     slices, grid = SliceModel().applied(volumes.slices, widths), volumes.grid
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     pixel_weight = weight[slices.pixel_plane].astype(np.float32)
-    value = (slices.masked_value / gain[slices.pixel_plane]).astype(np.float32)
+    value = slices.masked_value_without(gain).astype(np.float32)
     seen = operator.adjoint(pixel_weight)
     strength = np.float32(regulariser.strength * float(seen[seen > 0.1 * seen.max()].mean()))
     target = operator.adjoint(pixel_weight * value)

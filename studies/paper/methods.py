@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.acquisition.template_fit import fit_template
 from g3r.errors import G3RError
 from g3r.evaluation.align import Alignment
 from g3r.evaluation.case import SimulatedCase
@@ -167,7 +168,7 @@ def template_and_printed(posed: Posed, reconstructor: GaussianReconstructor, mot
     placed = placed_template(reconstructor.networks.prior, motion.orientation)
     if placed is not None:
         squares = least_squares_volume(volumes, posed.gain, posed.weight, posed.regularisers[1], posed.widths)
-        template = placed.fitted(volumes.sharp, volumes.share, volumes.density, volumes.grid)
+        template = fit_template(placed, volumes.sharp, volumes.share, volumes.density, volumes.grid)
         seen = np.clip(volumes.density / KNOWN_DENSITY, 0, 1)
         yield posed.made(FILL, seen * squares + (1 - seen) * template.values, start)
     yield _gaussians(posed, reconstructor, PRINTED, Unconstrained(attenuation="printed"))

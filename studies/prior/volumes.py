@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.coverage import brain_share, coverage
@@ -20,12 +20,12 @@ from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.smooth_fill import smooth_fill
+from g3r.acquisition.template_fit import fit_template
 from g3r.evaluation.case import SimulatedCase
 from g3r.fitting.prior_volume import KNOWN_DENSITY
 from g3r.geometry import VolumeGrid
 from g3r.prior.maps import PriorMaps, Tiling
 from g3r.prior.model import Prior
-from g3r.prior.subject_template import PlacedTemplate
 
 MARGIN_MM = 5.0
 """Margin around the slices, as in the reconstruction."""
@@ -59,7 +59,7 @@ def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
     return slices.with_pose(case.true.pose.take(rows) @ slices.header_pose)
 
 
-def template_at_truth(template: AtlasTemplate, truth: Volume, mask: NDArray[np.bool_]) -> PlacedTemplate:
+def template_at_truth(template: AtlasTemplate, truth: Volume, mask: NDArray[np.bool_]) -> PlacedHead:
     """The template of the most similar size, scaled to the volume of the true head and placed at its centre.
 
     Slices at their true poses are in the frame of the truth, which has the axes of the atlas frame.
@@ -72,14 +72,14 @@ def template_at_truth(template: AtlasTemplate, truth: Volume, mask: NDArray[np.b
     here_mm3 = mask.sum() * truth.grid.voxel_volume_mm3
     there_mm3 = (template.volume > 0).sum((1, 2, 3)) * template.grid.voxel_volume_mm3
     nearest = int(np.abs(np.log(there_mm3 / here_mm3)).argmin())
-    placed = PlacedTemplate.of(template, float(template.weeks[nearest]), float(np.cbrt(here_mm3 / there_mm3[nearest])))
+    placed = template.scaled_head(float(template.weeks[nearest]), float(np.cbrt(here_mm3 / there_mm3[nearest])))
     affine = placed.grid.affine.copy()
-    center_mm = placed.grid.world(np.argwhere(placed.volume > 0)).mean(0)
-    affine[:3, 3] += truth.grid.world(np.argwhere(mask)).mean(0) - center_mm
-    return PlacedTemplate(placed.volume, VolumeGrid(placed.grid.shape, affine))
+    center_mm = truth.grid.world(np.argwhere(mask)).mean(0)
+    affine[:3, 3] += center_mm - placed.center_mm
+    return PlacedHead(placed.volume, VolumeGrid(placed.grid.shape, affine), center_mm)
 
 
-def prior_volumes(prior: Prior, slices: Slices, placed: PlacedTemplate | None, n_views: int = 1) -> PriorVolumes:
+def prior_volumes(prior: Prior, slices: Slices, placed: PlacedHead | None, n_views: int = 1) -> PriorVolumes:
     """V_coarse, M_rho, V_sharp and V_prior of slices in their given poses.
 
     Args:
@@ -99,7 +99,7 @@ def prior_volumes(prior: Prior, slices: Slices, placed: PlacedTemplate | None, n
         known = np.clip(density / KNOWN_DENSITY, 0, 1)
         template, outline = smooth_fill(sharp, known), foreground(slices, grid).mask().astype(np.float32)
     else:
-        fitted = _timed(seconds, "template", lambda: placed.fitted(sharp, share, density, grid))
+        fitted = _timed(seconds, "template", lambda: fit_template(placed, sharp, share, density, grid))
         template, outline = fitted.values, fitted.inside
     maps = PriorMaps(coarse=coarse, density=density, share=share, sharp=sharp, template=template, outline=outline)
     values = _timed(seconds, "V_prior", lambda: prior.estimate(maps, n_views=n_views)).volume

@@ -24,10 +24,10 @@ RECORD_OF = {
 }
 """Blocks that come from the record of another block, which is the block whose command the page states."""
 
-OLDER_WEIGHTS = frozenset(
-    "sets unseen-sweep masks-written paper-variants-atlas paper-stages-atlas lattices in-plane time-budgets bias "
-    "convergence layers intensities slice-profile".split()
-)
+OLDER_WEIGHTS = {
+    *("sets", "unseen-sweep", "masks-written", "paper-variants-atlas", "paper-stages-atlas", "lattices", "in-plane"),
+    *("time-budgets", "bias", "convergence", "layers", "intensities", "slice-profile"),
+}
 """Blocks measured with earlier weights of the prior, before commit bc1df76, that do not name them. Blocks published
 since then do."""
 

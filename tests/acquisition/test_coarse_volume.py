@@ -24,12 +24,12 @@ TURNS = {
 def cube_stack(
     pixel_mm: float = 1.0,
     thickness_mm: float = 3.0,
-    distance_mm: float | None = None,
+    slice_spacing_mm: float | None = None,
     turn: np.ndarray = TURNS["axial"],
     value: float | None = 7.0,
 ) -> Stack:
     """A stack whose mask is a cube of 40 mm about the origin."""
-    spacing = np.array([pixel_mm, pixel_mm, distance_mm or thickness_mm])
+    spacing = np.array([pixel_mm, pixel_mm, slice_spacing_mm or thickness_mm])
     shape = tuple(np.rint(SIZE_MM / spacing).astype(int))
     affine = np.eye(4)
     affine[:3, :3] = turn * spacing
@@ -84,7 +84,7 @@ def test_three_stacks_count_thrice() -> None:
 
 
 def test_a_gap_lowers_the_density_to_thickness_over_distance() -> None:
-    density = density_inside(slices_from_stacks([cube_stack(thickness_mm=2.0, distance_mm=4.0)]))
+    density = density_inside(slices_from_stacks([cube_stack(thickness_mm=2.0, slice_spacing_mm=4.0)]))
     assert density.mean() == pytest.approx(0.5, abs=0.01)
     assert density.min() < 0.35  # in the gaps
     assert density.max() > 0.65
@@ -109,7 +109,7 @@ def test_weight_zero_leaves_pixels_out() -> None:
 
 
 def test_a_constant_comes_out_constant_and_nothing_where_nothing_was_seen() -> None:
-    slices = slices_from_stacks([cube_stack(thickness_mm=2.0, distance_mm=5.0)])
+    slices = slices_from_stacks([cube_stack(thickness_mm=2.0, slice_spacing_mm=5.0)])
     coarse, density = coarse_and_density(slices, VolumeGrid.isotropic([-40] * 3, [40] * 3, 2.0))
     seen = density > 1e-3
     assert 0.1 < seen.mean() < 0.4

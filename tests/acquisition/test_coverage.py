@@ -24,13 +24,13 @@ def stack(
     *,
     pixel_mm: tuple[float, float] = (1.0, 1.3),
     thickness_mm: float = 3.0,
-    distance_mm: float | None = None,
+    slice_spacing_mm: float | None = None,
     turn: np.ndarray | None = None,
     masked: tuple[slice, ...] = ALL,
     dark: slice = slice(0, 0),
 ) -> Stack:
     """A stack about the origin with a box as mask and some blank slices."""
-    spacing = np.array([*pixel_mm, thickness_mm if distance_mm is None else distance_mm])
+    spacing = np.array([*pixel_mm, thickness_mm if slice_spacing_mm is None else slice_spacing_mm])
     affine = np.eye(4)
     affine[:3, :3] = (np.eye(3) if turn is None else turn) * spacing
     affine[:3, 3] = -affine[:3, :3] @ ((np.array(shape) - 1) / 2)
@@ -101,7 +101,7 @@ def test_one_gapless_stack_covers_once(pixel_mm: tuple[float, float], thickness_
     assert density.mean() == pytest.approx(1, abs=0.01)
     assert 0.94 < density.min() <= density.max() < 1.06
     gap = slices_from_stacks(
-        [stack(shape, pixel_mm=pixel_mm, thickness_mm=thickness_mm, distance_mm=2 * thickness_mm, turn=turn)]
+        [stack(shape, pixel_mm=pixel_mm, thickness_mm=thickness_mm, slice_spacing_mm=2 * thickness_mm, turn=turn)]
     )
     assert coverage(gap, VolumeGrid.isotropic([-6] * 3, [6] * 3, voxel_mm)).mean() == pytest.approx(0.5, abs=0.12)
 

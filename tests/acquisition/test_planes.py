@@ -33,6 +33,24 @@ def test_take_keeps_pixels_values_and_slices_together(index: Any) -> None:
         np.testing.assert_array_equal(part.header_pose.rotation[new], slices.header_pose.rotation[old])
 
 
+def test_a_pixel_covers_its_area_times_the_thickness() -> None:
+    slices = slices_from_stacks(stacks_of_two())
+    expected = [x * y * t for (x, y), t in zip(slices.planes.spacing_mm, slices.thickness_mm, strict=True)]
+    np.testing.assert_array_equal(slices.pixel_volume_mm3, expected)
+    assert slices.typical_pixel_mm == pytest.approx(np.cbrt(np.median(expected)))
+
+
+def test_gains_are_divided_out_slice_by_slice(rng: np.random.Generator) -> None:
+    slices = slices_from_stacks(stacks_of_two())
+    gain = rng.uniform(0.5, 2, len(slices))
+    evened = slices.without_gain(gain)
+    assert evened.value.dtype == np.float32
+    first, end = slices.planes.offset[3:5]
+    np.testing.assert_allclose(evened.value[first:end], slices.value[first:end] / gain[3], rtol=1e-6)
+    np.testing.assert_array_equal(slices.masked_value_without(gain).astype(np.float32), evened.masked_value)
+    np.testing.assert_array_equal(slices.masked_value_without(None), slices.masked_value)
+
+
 def test_moving_the_world_moves_the_pixels_and_is_reported() -> None:
     slices = slices_from_stacks(stacks_of_two())
     motion = RigidPose.from_rotvec([[0.2, -0.1, 0.4]], [[5.0, -3, 2]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.template_fit import TemplateFit, fit_template
 from g3r.geometry import VolumeGrid
 
@@ -45,6 +47,7 @@ def head_in_template(place: np.ndarray) -> np.ndarray:
 
 
 TEMPLATE = brain(world(TEMPLATE_GRID))[0]
+PLACED = PlacedHead.of(TEMPLATE, TEMPLATE_GRID)
 TRUTH, INSIDE = brain(head_in_template(world(GRID)))
 HEAD = (1.3 * TRUTH - 0.35 * TRUTH**2).astype(np.float32)  # another contrast
 
@@ -54,7 +57,7 @@ def case(hidden: np.ndarray) -> dict[str, Any]:
     seen = gaussian_filter((~hidden).astype(np.float32), 0.75)
     known = seen > 1e-3
     noise = 0.05 * np.random.default_rng(0).standard_normal(GRID.shape).astype(np.float32)
-    return {"head": (HEAD + noise) * known, "share": (INSIDE & known).astype(np.float32), "seen": seen, "grid": GRID}
+    return {"head": (HEAD + noise) * known, "share": (INSIDE & known).astype(np.float32), "density": seen, "grid": GRID}
 
 
 SLABS = {
@@ -80,7 +83,7 @@ def hidden(request: pytest.FixtureRequest) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def fitted(hidden: np.ndarray) -> TemplateFit:
-    return fit_template(TEMPLATE, TEMPLATE_GRID, **case(hidden))
+    return fit_template(PLACED, **case(hidden))
 
 
 def test_the_hidden_part_is_found(hidden: np.ndarray, fitted: TemplateFit) -> None:
@@ -116,7 +119,7 @@ QUICK = (2, 2)
 
 
 def quickly() -> TemplateFit:
-    return fit_template(TEMPLATE, TEMPLATE_GRID, **case(SLABS["an end"]), n_steps=QUICK)
+    return fit_template(PLACED, **case(SLABS["an end"]), n_steps=QUICK)
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -126,7 +129,7 @@ def test_torch_gets_its_threads_back(fails: bool) -> None:
     try:
         if fails:
             with pytest.raises((ValueError, RuntimeError)):
-                fit_template(TEMPLATE[0], TEMPLATE_GRID, **case(SLABS["an end"]), n_steps=QUICK)
+                fit_template(replace(PLACED, volume=TEMPLATE[0]), **case(SLABS["an end"]), n_steps=QUICK)
         else:
             quickly()
         assert torch.get_num_threads() == 2
@@ -145,9 +148,16 @@ def test_it_works_where_gradients_are_off() -> None:
     assert not torch.is_inference_mode_enabled()
 
 
+def test_it_is_the_same_whatever_the_density() -> None:
+    given, seen = case(SLABS["an end"]), ~SLABS["an end"]
+    once, dense = (seen * np.where(world(GRID)[..., 0] > 0, n, 1).astype(np.float32) for n in (1, 9))
+    expected, found = (fit_template(PLACED, **{**given, "density": one}, n_steps=QUICK) for one in (once, dense))
+    np.testing.assert_array_equal(found.values, expected.values)
+
+
 def test_nothing_seen_is_no_failure() -> None:
     given = case(np.ones(GRID.shape, bool))
-    found = fit_template(TEMPLATE, TEMPLATE_GRID, **given, n_steps=QUICK)
+    found = fit_template(PLACED, **given, n_steps=QUICK)
     assert np.isfinite(found.values).all()
     # the outline is that of the placed template
     assert dice(found.inside > 0.5, brain(world(GRID))[1]) > 0.96

@@ -12,14 +12,7 @@ pytest.importorskip("torchio")
 
 from data_synth.atlas import cropped, find_subjects, load_subject
 from data_synth.heads import PhantomSubject
-from data_synth.prior_samples import (
-    IMAGE_KEYS,
-    OTHER_AGE_WEEKS,
-    SyntheticSubjects,
-    TemplateHead,
-    patch_corners,
-    synthesise,
-)
+from data_synth.prior_samples import IMAGE_KEYS, OTHER_AGE_WEEKS, SyntheticSubjects, patch_corners, synthesise
 from data_synth.template import HALF_WINDOW_WEEKS, atlas_templates
 from g3r.acquisition.atlas_template import AtlasTemplate
 
@@ -193,7 +186,7 @@ def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
 def test_a_real_atlas(shared_data: Path) -> None:
     subject = find_subjects(shared_data / "atlas", include=["crl-sta/sta2?"])[0]
     volume = cropped(load_subject(subject, SPACING_MM), 4)
-    head = TemplateHead(template().volume[0], template().grid)
+    head = template().head(0)
     one = synthesise(volume, head, np.random.default_rng(0))
     assert one.truth.shape == volume.data.shape
     assert np.isfinite(one.coarse).all()

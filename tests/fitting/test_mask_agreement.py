@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.brain_mask import MaskSource
 from g3r.acquisition.slicing import normalised_slices
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.mask_agreement import MAX_CHANGE, refine_masks
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.prior.subject_template import PlacedTemplate
 from g3r.registration import Registration
 
 RADIUS_MM = 22.0
@@ -60,11 +60,11 @@ def registered(stacks: list[Stack]) -> tuple[Registration, float]:
     ), intensity
 
 
-def template() -> PlacedTemplate:
+def template() -> PlacedHead:
     """A template ball at the place of the moved ball."""
     grid = VolumeGrid.isotropic([-40] * 3, [40] * 3, 2.0)
     world_mm = grid.world(np.moveaxis(np.indices(grid.shape), 0, -1))
-    return PlacedTemplate(ball(world_mm - MOVED.translation_mm[0]).astype(np.float32), grid)
+    return PlacedHead.of(ball(world_mm - MOVED.translation_mm[0]).astype(np.float32), grid)
 
 
 def dice(a: np.ndarray, b: np.ndarray) -> float:

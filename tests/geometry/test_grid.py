@@ -26,6 +26,31 @@ AXES = {
 }
 
 
+def test_a_grid_scaled_about_a_point_keeps_that_point_and_its_shape() -> None:
+    grid = VolumeGrid((4, 5, 6), affine_of(AXES["oblique"], (1.0, 2.0, 3.0), (5.0, -7.0, 2.0)))
+    center_mm = np.array([3.0, 1.0, -4.0])
+    scaled = grid.scaled_about(center_mm, 1.5)
+    index = np.array([[0.0, 0, 0], [3, 4, 5], [1.5, 2, 0.5]])
+    np.testing.assert_allclose(scaled.world(index) - center_mm, 1.5 * (grid.world(index) - center_mm), atol=1e-12)
+    np.testing.assert_allclose(scaled.index(center_mm), grid.index(center_mm), atol=1e-12)
+    assert scaled.shape == grid.shape
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_axes_are_unit_vectors_and_the_frame_of_a_plane_is_right_handed(name: str) -> None:
+    grid = VolumeGrid((4, 5, 6), affine_of(AXES[name], (1.0, 2.0, 3.0), (5.0, -7.0, 2.0)))
+    np.testing.assert_allclose(grid.axes, AXES[name], atol=1e-12)
+    assert grid.shear < 1e-12
+    np.testing.assert_allclose(grid.plane_frame[:, :2], AXES[name][:, :2], atol=1e-12)
+    assert np.linalg.det(grid.plane_frame) == pytest.approx(1)
+
+
+def test_the_shear_is_the_largest_cosine_between_axes() -> None:
+    axes = AXES["oblique"].copy()
+    axes[:, 2] = 0.8 * axes[:, 2] - 0.6 * axes[:, 0]
+    assert VolumeGrid((4, 5, 6), affine_of(axes, (1.0, 2.0, 3.0), (5.0, -7.0, 2.0))).shear == pytest.approx(0.6)
+
+
 @pytest.mark.parametrize("origin", [(-40.0, 30.0, 12.5), (1e4, -1e4, 1e4)])
 @pytest.mark.parametrize("name", AXES)
 def test_world_and_index_are_inverse(name: str, origin: tuple[float, float, float]) -> None:

@@ -15,9 +15,9 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import standard_orientation
 from g3r.registration.atlas_search import (
-    fitted_template,
     nearest_templates,
     place_in_atlas,
+    scaled_template,
     template_fits,
     template_orientations,
 )
@@ -153,10 +153,10 @@ def test_masks_of_another_size_than_any_head_are_refused(
     assert set(estimate.initialisations) == {"headers"}
 
 
-def test_a_fitted_head_has_the_volume_asked_for_and_the_same_middle(template: AtlasTemplate) -> None:
+def test_a_scaled_head_has_the_volume_asked_for_and_the_same_middle(template: AtlasTemplate) -> None:
     for volume_mm3 in (1e5, 4e5):
         for number in range(len(template)):
-            head = fitted_template(template, number, volume_mm3)
+            head = scaled_template(template, number, volume_mm3)
             inside = template.volume[number] > 0
             assert inside.sum() * head.grid.voxel_volume_mm3 == pytest.approx(volume_mm3)
             np.testing.assert_allclose(head.grid.world(np.argwhere(inside)).mean(0), head.center_mm, atol=1e-9)
@@ -201,7 +201,7 @@ def test_the_whole_head_turned_is_among_the_orientations_to_follow(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
 ) -> None:
     slices, _ = still_slices
-    head = fitted_template(template, 0, head_volume_mm3(slices))
+    head = scaled_template(template, 0, head_volume_mm3(slices))
     turned = headers_turned(slices, [2.0, -1.2, 1.5])
     back = Rotation.from_rotvec([2.0, -1.2, 1.5]).as_matrix().T
     first = template_orientations(StackSamples.of_all(turned), head)[0]

@@ -66,12 +66,11 @@ def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedS
 def test_the_finest_voxel_follows_what_a_pixel_covers(still: list[SimulatedStack]) -> None:
     """In a volume with smaller voxels each slice would be registered to itself."""
     slices, _ = as_slices(still)
-    covered_mm3 = float(np.median(slices.planes.spacing_mm.prod(1) * slices.thickness_mm))
     last = [
         register(slices, replace(OFF, n_rounds=2, finest_voxel_mm=mm, finest_voxel_pixels=0.8)).history[-1]["voxel_mm"]
         for mm in (0.5, 3.0)
     ]
-    assert last == pytest.approx([0.8 * covered_mm3 ** (1 / 3), 3.0])
+    assert last == pytest.approx([0.8 * slices.typical_pixel_mm, 3.0])
 
 
 def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]) -> None:

@@ -5,21 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_synth.motion import MotionLevel
-from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import held_out
 from g3r.registration.held_out import (
     best_initialisation,
-    estimate_interleave,
     fine_held_out_correlations,
     held_out_score,
     predict,
     volume_without,
 )
 from g3r.registration.similarity import StackSamples
-from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed, stack_moved, turned_about
+from tests.registration.moving_heads import Moving, slices_disturbed, stack_moved, turned_about
 
 
 def test_true_poses_predict_better_than_wrong_ones(
@@ -119,14 +116,6 @@ def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose])
     np.testing.assert_array_equal(grid.affine, again_grid.affine)
     everything, _ = volume_without(replace(slices, value=brighter), -1, 3.2)
     assert everything.max() > 1.3 * volume.max()
-
-
-def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom) -> None:
-    for interleave in (1, 2, 3):
-        level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
-        slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
-        (sample,) = StackSamples.of_all(slices)
-        assert estimate_interleave(sample, truth) == interleave
 
 
 def test_the_fine_correlation_asks_only_where_others_saw(still_slices: tuple[Slices, RigidPose]) -> None:

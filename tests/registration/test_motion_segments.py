@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from data_synth.motion import MotionLevel
+from data_synth.phantom import Phantom
 from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
 from g3r.registration.motion_segments import (
@@ -16,11 +18,14 @@ from g3r.registration.motion_segments import (
     best_segments,
     changes_in_time,
     cheapest_path,
+    estimate_interleave,
     head_distance_mm,
     promising,
     time_orders,
     transition_penalty,
 )
+from g3r.registration.similarity import StackSamples
+from tests.registration.moving_heads import as_slices, simulated
 
 CENTER_MM = np.array([12.0, -7.0, 40.0])
 
@@ -69,6 +74,14 @@ def test_the_distance_does_not_depend_on_where_the_head_is() -> None:
 def test_time_orders_know_that_slices_are_missing() -> None:
     orders = time_orders(np.array([2, 3, 4, 6, 9]))
     assert {k: v.tolist() for k, v in orders.items()} == {1: [0, 1, 2, 3, 4], 2: [0, 2, 3, 1, 4], 3: [1, 3, 4, 2, 0]}
+
+
+def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom) -> None:
+    for interleave in (1, 2, 3):
+        level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
+        slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
+        (sample,) = StackSamples.of_all(slices)
+        assert estimate_interleave(truth, sample.slice_index, sample.pixels.center_mm) == interleave
 
 
 def lattice(n: int) -> RigidPose:

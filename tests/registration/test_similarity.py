@@ -9,7 +9,16 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.planes import Planes, Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.pose_sampling import perturbed
-from g3r.registration.similarity import GAIN_RANGE, SearchPixels, halved_voxels, mean_square_residual, own_moments
+from g3r.registration.similarity import (
+    CORRELATION_AREA_MM2,
+    GAIN_RANGE,
+    SearchPixels,
+    best_gain,
+    halved_voxels,
+    mean_square_residual,
+    own_moments,
+    student_cost,
+)
 from tests.registration.moving_heads import slices_disturbed
 
 CENTER_MM = np.array([10.0, -20.0, 30.0])
@@ -156,6 +165,15 @@ def test_costs_of_the_search_are_near_those_of_trilinear_reading(rng: np.random.
     assert (np.abs(fine - trilinear).mean(0) < np.abs(coarse - trilinear).mean(0)).mean() > 0.8
 
 
+def test_the_cost_of_a_slice_grows_with_its_area_and_with_the_logarithm_of_a_large_residual() -> None:
+    area_mm2 = np.array([1.0, 3.0]) * CORRELATION_AREA_MM2
+    residual = np.array([[0.0, 0.02, 20.0, 20_000.0]] * 2)
+    small, large = student_cost(residual, 0.01, area_mm2)
+    np.testing.assert_allclose(small[:2], [0.0, np.log(2)])
+    assert small[3] - small[2] == pytest.approx(np.log(1000), rel=1e-3)
+    np.testing.assert_allclose(large, 3 * small)
+
+
 def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generator) -> None:
     slices = few_slices()
     pixels = SearchPixels.of(slices)
@@ -177,6 +195,11 @@ def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.rando
         for a, b in zip(y, m, strict=True)
     ]
     np.testing.assert_allclose(mean_square_residual(moments), expected, rtol=1e-4)
+    np.testing.assert_allclose(best_gain(moments, (0.01, 100.0)), (y * m).sum(1) / (m * m).sum(1))
+
+
+def test_the_best_gain_of_a_slice_where_the_volume_is_empty_is_the_lowest() -> None:
+    assert best_gain(np.array([10.0, 5, 0, 4, 0, 0]), (0.05, 20.0)) == 0.05
 
 
 def test_the_residual_of_an_empty_model_is_the_image_and_never_negative() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from g3r.acquisition.area_profile import area_profiles
+from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import rotation_matrix
@@ -12,7 +13,7 @@ from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.overlap import overlap_of
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_registration import NeighbourTie
-from g3r.registration.unseen import TemplateFill, coverage_share, sampled, with_header_spans
+from g3r.registration.unseen import coverage_share, filled_with_head, grid_with_head, sampled, with_header_spans
 
 
 def upper_halves_gone(slices: Slices) -> Slices:
@@ -21,10 +22,10 @@ def upper_halves_gone(slices: Slices) -> Slices:
     return slices.take(np.concatenate(kept))
 
 
-def the_head(slices: Slices) -> TemplateFill:
-    """The head itself as template: a volume of all slices."""
+def the_head(slices: Slices) -> PlacedHead:
+    """The head itself as template: a volume of all its slices."""
     volume, grid = volume_without(slices, -1, 3.2)
-    return TemplateFill(volume, grid, slices.planes.pixel_world_mm(slices.pixel_index).mean(0))
+    return PlacedHead(volume, grid, slices.planes.pixel_world_mm(slices.pixel_index).mean(0))
 
 
 def test_the_template_stands_for_what_others_did_not_see(still_slices: tuple[Slices, RigidPose]) -> None:
@@ -41,11 +42,11 @@ def test_the_fill_leaves_what_was_seen(still_slices: tuple[Slices, RigidPose]) -
     slices = still_slices[0]
     fill = the_head(slices)
     halves = upper_halves_gone(slices)
-    grid = fill.grid_with(fill.grid)
+    grid = grid_with_head(fill.grid, fill)
     volume = np.full(grid.shape, 0.5, np.float32)
     coverage = np.zeros(grid.shape, np.float32)
     coverage[: grid.shape[0] // 2] = 1
-    found = fill.filled(volume, grid, coverage)
+    found = filled_with_head(volume, grid, coverage, fill)
     assert (found[: grid.shape[0] // 2] == 0.5).all()
     assert found[grid.shape[0] // 2 :].max() > 0.2
     assert volume_without(halves, 0, 3.2, fill)[1].shape >= volume_without(halves, 0, 3.2)[1].shape

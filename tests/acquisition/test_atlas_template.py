@@ -1,4 +1,4 @@
-"""The template of a subject: the head nearest in age, scaled about its own centre, fitted to the seen part."""
+"""Heads of an atlas template: the one nearest in age, scaled about its own centre."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.geometry import VolumeGrid
-from g3r.prior.subject_template import PlacedTemplate
 
 GRID = VolumeGrid.isotropic([-30, -30, -30], [30, 30, 30], 2.0)
 WORLD = GRID.world(np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1))
@@ -25,37 +24,20 @@ TEMPLATE = AtlasTemplate(np.stack([ball(16), ball(20), ball(24)]), GRID.affine, 
 
 @pytest.mark.parametrize(("weeks", "expected"), [(20.0, 0), (25.9, 0), (26.1, 1), (30.4, 1), (30.6, 2), (40.0, 2)])
 def test_the_nearest_age_is_taken(weeks: float, expected: int) -> None:
-    placed = PlacedTemplate.of(TEMPLATE, weeks, 1.0)
+    placed = TEMPLATE.scaled_head(weeks, 1.0)
     np.testing.assert_array_equal(placed.volume, TEMPLATE.volume[expected])
     np.testing.assert_allclose(placed.grid.affine, TEMPLATE.affine, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.25])
 def test_it_is_enlarged_about_its_own_centre(scale: float) -> None:
-    placed = PlacedTemplate.of(TEMPLATE, 28.0, scale)
+    placed = TEMPLATE.scaled_head(28.0, scale)
     inside = placed.grid.world(np.argwhere(placed.volume > 0))
     np.testing.assert_allclose(inside.mean(0), CENTER_MM, atol=0.05)
+    np.testing.assert_array_equal(placed.center_mm, inside.mean(0))
     low, high = placed.box_mm()
     np.testing.assert_allclose(high - low, 2 * 20 * scale, atol=4.1 * scale)
     np.testing.assert_allclose((low + high) / 2, CENTER_MM, atol=1.1 * scale)
     np.testing.assert_allclose(low, inside.min(0))
     np.testing.assert_allclose(placed.grid.spacing_mm, 2 * scale)
     np.testing.assert_allclose(TEMPLATE.affine, GRID.affine)  # the atlas template itself is unchanged
-
-
-def test_it_is_fitted_to_what_was_seen_whatever_the_density() -> None:
-    """A head of another size and place, one half of which is seen, partly by many slices."""
-    grid = VolumeGrid.isotropic([-34] * 3, [34] * 3, 2.0)
-    world = grid.world(np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1))
-    shift, size = np.array([2.0, -1.5, 1.0]), 1.07
-    head = ball(20, CENTER_MM + (world - CENTER_MM - shift) / size)
-    seen = (world[..., 2] < 2).astype(np.float32)
-    placed = PlacedTemplate.of(TEMPLATE, 28.0, 1.0)
-    share = (head > 0) * seen
-    found = placed.fitted(head * seen, share, seen, grid)
-    unseen_part = (seen == 0) & (head > 0)
-    error = np.abs(found.values - head)[unseen_part].mean()
-    unfitted = np.abs(ball(20, world) - head)[unseen_part].mean()
-    assert error < 0.6 * unfitted
-    dense = placed.fitted(head * seen, share, seen * np.where(world[..., 0] > 0, 9, 1).astype(np.float32), grid)
-    np.testing.assert_allclose(dense.values, found.values, atol=1e-5)
