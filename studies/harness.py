@@ -206,10 +206,8 @@ def stated(text: str, record: Record) -> str:
     """
     if "commit " in text or "|" not in text:
         return text
-    line = machine_line(record["machine"])
-    if "weights" in record and record["weights"] not in text:
-        line += f" Prior of weights {record['weights']}."
-    return f"{text}\n\n{line}"
+    unsaid = "weights" in record and record["weights"] not in text
+    return f"{text}\n\n{machine_line(record['machine'])}" + f" Prior of weights {record.get('weights')}." * unsaid
 
 
 def left_text(n_done: int, n_all: int, seconds: float) -> str:

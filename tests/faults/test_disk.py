@@ -210,22 +210,6 @@ def test_an_empty_mount_point_is_written_and_an_earlier_result_in_it_replaced(
         assert (small_disk / "volume.nii.gz").read_bytes() == case.volume
 
 
-def test_the_working_folder_takes_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally) -> None:
-    """Renamed and replaced, it would leave the user's shell in a removed folder."""
-    from g3r.run.output_folder import OutputFolder, check_output_folder
-
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "notes").write_text("mine")
-    for text in ("first", "second"):
-        with tally.case():
-            check_output_folder(Path("."), {"run.json"}, replace=True)
-            with OutputFolder(".", {"run.json"}) as run, run.result() as staged:
-                (staged / "run.json").write_text(text)
-            assert Path.cwd() == tmp_path
-            assert Path("run.json").read_text() == text
-            assert names(Path(".")) == {"run.json", "notes"}
-
-
 @pytest.mark.parametrize("moved", range(9))
 def test_a_run_killed_while_files_move_onto_a_mount_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally, moved: int

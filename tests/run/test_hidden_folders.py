@@ -12,8 +12,8 @@ from g3r.run.hidden_folders import HiddenFolders, name_alone
 @pytest.mark.parametrize(
     ("word", "told"),
     [
-        ("/home/JANE/a.nii.gz", "a.nii.gz"),
-        ("--output=/home/JANE/out/", "--output=out"),
+        ("/data/JANE/a.nii.gz", "a.nii.gz"),
+        ("--output=/data/JANE/out/", "--output=out"),
         ("--preset", "--preset"),
         ("fast", "fast"),
         ("0.8", "0.8"),
