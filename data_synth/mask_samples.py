@@ -63,7 +63,6 @@ def draw_sample(
     wide_shape: tuple[int, int, int],
     pixel_mm: float,
     crop_shape: tuple[int, int, int],
-    wrap_share: float = WRAP_SHARE,
 ) -> MaskSample:
     """A sample of a scan.
 
@@ -74,12 +73,11 @@ def draw_sample(
         wide_shape: its pixels and slices; a random part of a larger scan.
         pixel_mm: of the crop.
         crop_shape: pixels and slices of the crop.
-        wrap_share: of wide images in which what is beyond the field of view folds into it.
     """
     wide_image, wide_mask = _wide(scan, rng, wide_mm, wide_shape)
     image, mask = _crop(scan, rng, pixel_mm, crop_shape)
     return MaskSample(
-        wide_image=with_artefacts(wide_image, rng, wrap_share, WIDE_NOISE),
+        wide_image=with_artefacts(wide_image, rng, WRAP_SHARE, WIDE_NOISE),
         wide_mask=wide_mask,
         image=with_artefacts(image, rng),
         mask=mask,
