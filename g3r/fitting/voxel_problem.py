@@ -19,6 +19,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 from g3r.acquisition.total_variation import diffusivity, divergence_of_gradient
 from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.best_gains import best_gains
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.slice_stage import SliceFit
 from g3r.geometry import VolumeGrid
@@ -124,9 +125,8 @@ class FitPixels:
         return robust_width(self._off(volume, grid)[counts]) if counts.any() else 0.0
 
     def _off(self, volume: Array, grid: VolumeGrid) -> NDArray[np.float64]:
-        predicted, n = self.operator(grid).forward(volume), len(self.slices)
-        across, own = (np.bincount(self.plane, self.weight * predicted * one, n) for one in (self.value, predicted))
-        gain = np.divide(across, own, out=np.ones(n), where=own > 0)
+        predicted = self.operator(grid).forward(volume)
+        gain = best_gains(self.weight, predicted, self.value, self.plane, len(self.slices), of_nothing=1)
         return gain[self.plane] * predicted - self.value
 
 
