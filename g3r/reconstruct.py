@@ -12,13 +12,14 @@ from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
-from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
+from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.lattice_mean import fit_lattices
 from g3r.fitting.mask_agreement import REFINED
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import fit_to_prior
+from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE
@@ -30,7 +31,7 @@ from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
 from g3r.registration import GivenPoses, Registration, RegistrationSettings, register_robustly
 from g3r.registration.atlas_search import template_fits
-from g3r.registration.given import measure
+from g3r.registration.given import measure, with_pixels_of
 from g3r.registration.quality import unknown_orientation_note
 from g3r.report.reported_result import ReportedResult
 from g3r.run.context import RunContext
@@ -281,11 +282,10 @@ class GaussianReconstructor:
         widths, n_steps = held_out.widths if held_out else None, settings.slice_stage.n_steps
 
         def fit() -> SliceFit:
-            target = slice_target(prior, poses.weight, settings.slice_model, widths)
             return fit_lattices(
                 cloud,
                 prior,
-                target,
+                slice_target(prior, poses.weight, settings.slice_model, widths),
                 settings.n_lattices,
                 weight=poses.weight,
                 distillation=settings.use_prior and settings.distillation,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,7 @@ from g3r.acquisition.coverage import brain_share
 from g3r.acquisition.foreground import Foreground, Votes
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
-from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
-from g3r.registration import Registration
 
 MARGIN_MM = 5.0
 """Margin of the prior's grid around the masked pixels."""
@@ -121,64 +119,3 @@ def _with_room(grid: VolumeGrid, box_mm: tuple[NDArray[np.float64], NDArray[np.f
     if (new_low == low).all() and (new_high == high).all():
         return grid
     return VolumeGrid.isotropic(new_low, new_high, float(grid.spacing_mm[0]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PriorVolume:
-    """V_prior with its masks: start and target of the fit.
-
-    Attributes:
-        volumes: the slices as they are fitted, and the volumes that they give.
-        values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp, smoothly continued, where no network is used.
-        brain: probability [I, J, K] of each voxel being brain by its shape; None where no network is used.
-        mask: [I, J, K] the brain: as seen, and by its shape where nothing was seen.
-        support: [I, J, K] where Gaussians are fitted: the mask and its margin.
-        has_template: whether an atlas template was fitted, which V_prior shows where no slice looked.
-        gain: [K] intensity factors of the slices.
-        scale: intensity that slices were divided by since registration.
-        accepted: whether slices of a single stack moved to the prior; None where that was not tried.
-    """
-
-    volumes: InitialVolumes
-    values: NDArray[np.float32]
-    brain: NDArray[np.float32] | None
-    mask: NDArray[np.bool_]
-    support: NDArray[np.bool_]
-    has_template: bool
-    gain: NDArray[np.float64]
-    scale: float
-    accepted: bool | None = None
-
-
-def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
-    """A registration whose slices have the pixels of the slices to be fitted.
-
-    Raises:
-        InputError: the two are not about the same slices.
-    """
-    found = registration.slices
-    slices = slices.take(~np.isin(slices.stack_id, [n for n, _ in registration.left_out]))
-    if not (np.array_equal(found.stack_id, slices.stack_id) and np.array_equal(found.slice_index, slices.slice_index)):
-        raise InputError(
-            f"registration of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
-            "register the same stacks with the same masks"
-        )
-    return replace(registration, slices=slices.with_pose(found.planes.pose))
-
-
-@dataclass(frozen=True, kw_only=True)
-class LatticeSpacing:
-    """Spacing of the lattice of Gaussians.
-
-    Args:
-        pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers.
-        at_most_mm: upper bound of that edge in mm, whatever the pixels: the cortex is as thick in thick slices.
-    """
-
-    pixels: float
-    at_most_mm: float
-
-    def mm(self, slices: Slices) -> float:
-        """Cell edge per Gaussian for the median pixel of some slices."""
-        covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
-        return min(self.pixels * float(np.median(covered_mm3)) ** (1 / 3), self.at_most_mm)
