@@ -65,8 +65,7 @@ def test_the_same_images_as_at_inference(centred_head: TruthVolume, sampled: Hea
     slices = slices_from_stacks([one.stack for one in stacks])
     images = slice_images(slices, 3.0, 40)
     motion = [stacks[s].true_pose.take([k]) for s, k in zip(slices.stack_id, slices.slice_index, strict=True)]
-    moved = RigidPose(np.concatenate([m.rotation for m in motion]), np.concatenate([m.translation_mm for m in motion]))
-    pose = moved @ slices.header_pose @ images.frame_in_slice
+    pose = RigidPose.concatenated(motion) @ slices.header_pose @ images.frame_in_slice
     fast, _ = sample_slices(sampled, np.linalg.inv(sampled.affine).astype(float), pose, images.thickness_mm, 3.0, 40)
     for image, other in zip(images.image, fast, strict=True):
         if (other > 0).sum() > 60:
