@@ -15,7 +15,6 @@ from data_synth.augment import applied
 from data_synth.mask_scans import Scan
 from g3r.acquisition.axis_resampling import along_axes, axis_weights
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 N_OVERSAMPLED = 2

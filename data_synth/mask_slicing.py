@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from data_synth.slice_sampling import pixel_lines, trilinear
 from g3r.geometry import RigidPose
 
-Array = NDArray[np.float64]
-
 
 def image_slices(
     head: NDArray[np.float32],
