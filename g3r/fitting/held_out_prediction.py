@@ -56,9 +56,9 @@ class HeldOutFit:
         planes = replace(planes, psf_var_mm2=planes.psf_var_mm2 * np.array([1, 1, stretch**2]))
         predicted, measured = render(self.cloud, planes).numpy()[index] * self.field, self.slices.value[index]
         gain = best_gains(self.share, predicted, measured, number, len(self.slices), of_nothing=1)
+        off: NDArray[np.float64] = np.abs(gain[number] * predicted - measured)
         # times the share, by which the pixel was divided when its surroundings were taken out
-        off: NDArray[np.float64] = self.share * np.abs(gain[number] * predicted - measured)
-        return off
+        return self.share * off
 
     def relative_widths(self, stack_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Width of each stack's profile [N], through the plane, over that of the fit; their geometric mean is 1.
