@@ -12,14 +12,13 @@ from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.lattice_mean import fit_lattices
 from g3r.fitting.mask_agreement import REFINED
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import fit_to_prior
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE
@@ -282,10 +281,11 @@ class GaussianReconstructor:
         widths, n_steps = held_out.widths if held_out else None, settings.slice_stage.n_steps
 
         def fit() -> SliceFit:
+            target = slice_target(prior, poses.weight, settings.slice_model, widths)
             return fit_lattices(
                 cloud,
                 prior,
-                slice_target(prior, poses.weight, settings.slice_model, widths),
+                target,
                 settings.n_lattices,
                 weight=poses.weight,
                 distillation=settings.use_prior and settings.distillation,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.held_out_prediction import MIN_HELD_OUT, HeldOutFit, lowest
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
 from g3r.fitting.prior_targets import distillation_target
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceModel, SliceTarget, slice_target
 from g3r.gaussians import GaussianCloud

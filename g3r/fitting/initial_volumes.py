@@ -119,3 +119,30 @@ def _with_room(grid: VolumeGrid, box_mm: tuple[NDArray[np.float64], NDArray[np.f
     if (new_low == low).all() and (new_high == high).all():
         return grid
     return VolumeGrid.isotropic(new_low, new_high, float(grid.spacing_mm[0]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorVolume:
+    """V_prior with its masks: start and target of the fit.
+
+    Attributes:
+        volumes: the slices as they are fitted, and the volumes that they give.
+        values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp, smoothly continued, where no network is used.
+        brain: probability [I, J, K] of each voxel being brain by its shape; None where no network is used.
+        mask: [I, J, K] the brain: as seen, and by its shape where nothing was seen.
+        support: [I, J, K] where Gaussians are fitted: the mask and its margin.
+        has_template: whether an atlas template was fitted, which V_prior shows where no slice looked.
+        gain: [K] intensity factors of the slices.
+        scale: intensity that slices were divided by since registration.
+        accepted: whether slices of a single stack moved to the prior; None where that was not tried.
+    """
+
+    volumes: InitialVolumes
+    values: NDArray[np.float32]
+    brain: NDArray[np.float32] | None
+    mask: NDArray[np.bool_]
+    support: NDArray[np.bool_]
+    has_template: bool
+    gain: NDArray[np.float64]
+    scale: float
+    accepted: bool | None = None

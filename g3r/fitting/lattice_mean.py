@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import NO_PROGRESS, PriorCloud, PriorStageSettings
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceTarget
 from g3r.gaussians import GaussianCloud

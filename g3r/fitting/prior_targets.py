@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.coarse_volume import confidence
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import PriorCloud, PriorStageSettings, VolumeTarget, fit_prior
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.gaussians.seeding import seed_cloud
 from g3r.run.deadline import Deadline
 

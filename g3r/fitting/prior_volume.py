@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.coverage import UNSEEN_BELOW
 from g3r.acquisition.smooth_fill import smooth_fill
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.least_squares_volume import least_squares_volume
 from g3r.prior.maps import PriorMaps, Tiling
 from g3r.prior.subject_template import PlacedTemplate
@@ -21,33 +20,6 @@ if TYPE_CHECKING:
 
 KNOWN_DENSITY = 2 * UNSEEN_BELOW
 """Density from which on the slices' volume is taken unchanged, if no template fills what is missing."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PriorVolume:
-    """V_prior with its masks: start and target of the fit.
-
-    Attributes:
-        volumes: the slices as they are fitted, and the volumes that they give.
-        values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp, smoothly continued, where no network is used.
-        brain: probability [I, J, K] of each voxel being brain by its shape; None where no network is used.
-        mask: [I, J, K] the brain: as seen, and by its shape where nothing was seen.
-        support: [I, J, K] where Gaussians are fitted: the mask and its margin.
-        has_template: whether an atlas template was fitted, which V_prior shows where no slice looked.
-        gain: [K] intensity factors of the slices.
-        scale: intensity that slices were divided by since registration.
-        accepted: whether slices of a single stack moved to the prior; None where that was not tried.
-    """
-
-    volumes: InitialVolumes
-    values: NDArray[np.float32]
-    brain: NDArray[np.float32] | None
-    mask: NDArray[np.bool_]
-    support: NDArray[np.bool_]
-    has_template: bool
-    gain: NDArray[np.float64]
-    scale: float
-    accepted: bool | None = None
 
 
 def placed_template(prior: Prior | None, orientation: Orientation | None) -> PlacedTemplate | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.surroundings import without_surroundings
-from g3r.fitting.prior_volume import PriorVolume
+from g3r.fitting.initial_volumes import PriorVolume
 
 
 @dataclass(frozen=True, kw_only=True)

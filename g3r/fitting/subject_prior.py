@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.intensity_matching import match_intensities
 from g3r.fitting.mask_agreement import RefinedMasks, refine_masks
-from g3r.fitting.prior_volume import PriorVolume, placed_template, prior_volume
+from g3r.fitting.prior_volume import placed_template, prior_volume
 from g3r.prior.maps import Tiling
 from g3r.registration import Registration
 from g3r.registration.prior_registration import register_to_prior

@@ -10,8 +10,8 @@ import numpy as np
 
 from g3r.acquisition.intensity_levels import gain_in_files
 from g3r.acquisition.slicing import by_headers
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.lattice_mean import mean_cloud
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.maps import VolumeMaps, estimate_maps
 from g3r.output.mixture import FinishedVolume

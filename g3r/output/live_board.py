@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes
 from g3r.fitting.held_out_slices import HeldOutChoice
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.observer import FitMoment, SliceMoment
 from g3r.fitting.pose_rounds import RefinedPoses
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.output.mixture import FinishedVolume

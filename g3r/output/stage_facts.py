@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from g3r.fitting.held_out_slices import HeldOutChoice
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.mask_agreement import RefinedMasks
 from g3r.fitting.pose_rounds import MAX_LOSS, RefinedPoses
 from g3r.fitting.prior_stage import PriorCloud
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.mixture import FinishedVolume
 from g3r.registration import Registration

@@ -8,9 +8,9 @@ from typing import Any
 
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.held_out_slices import HeldOutChoice
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud
 from g3r.registration import Registration

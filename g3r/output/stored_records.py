@@ -6,10 +6,9 @@ from g3r.acquisition.area_profile import AreaProfile
 from g3r.acquisition.foreground import Foreground
 from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.fitting.held_out_slices import HeldOutChoice
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses
 from g3r.fitting.prior_stage import PriorCloud
-from g3r.fitting.prior_volume import PriorVolume
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose, VolumeGrid

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.foreground import foreground
 from g3r.errors import NumericalError
 from g3r.fitting.edge_by_image import shown_by_image
-from g3r.fitting.prior_volume import PriorVolume
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_weight import ended_early, noise_of, prior_weight
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from g3r.fitting.prior_volume import PriorVolume
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.planning.presets import ReconstructionSettings
 from g3r.run.deadline import Deadline, LoopRecord
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.prior_volume import PriorVolume
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud

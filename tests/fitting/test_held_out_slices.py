@@ -12,10 +12,10 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.held_out_prediction import HeldOutFit, lowest
 from g3r.fitting.held_out_slices import HeldOutChoice, HeldOutSettings, ask_held_out_slices, held_out_rows
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.prior_targets import fit_to_prior
-from g3r.fitting.prior_volume import PriorVolume, prior_volume
+from g3r.fitting.prior_volume import prior_volume
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel, slice_target
 from g3r.gaussians import GaussianCloud, render

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.lattice_mean import SPACINGS, fit_lattices, mean_cloud
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.prior_targets import fit_to_prior
-from g3r.fitting.prior_volume import PriorVolume, prior_volume
+from g3r.fitting.prior_volume import prior_volume
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel, slice_target
 from g3r.gaussians import GaussianCloud, render
