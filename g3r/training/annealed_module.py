@@ -101,8 +101,9 @@ class AnnealedModule(LightningModule):
         data: Any = getattr(self.trainer, "datamodule", None)
         if not hasattr(data, "template"):
             return
-        template, config = data.template(), self.network.config
+        template = data.template()
         self.network.set_template(torch.from_numpy(template.volume))
+        config = self.network.config  # may have taken the shape of the template
         if not np.allclose(template.affine, config.template_grid.affine, atol=1e-3):
             raise InputError(
                 f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
