@@ -20,7 +20,6 @@ from data_synth.mask_samples import MaskSample, draw_sample
 from data_synth.mask_scans import Scene, draw_scan
 from data_synth.mask_surroundings import draw_surroundings
 from data_synth.subject_dataset import SubjectDataset
-from g3r.errors import InputError
 
 HEAD_SPACING_MM = 1.2
 N_VAL_PHANTOMS = 6
@@ -29,11 +28,6 @@ SCALE_RANGE = (0.86, 1.08)
 """Range of the factor on a head's size; it also makes heads smaller than those of atlases, which begin at 21 weeks."""
 NEGATIVE_EVERY = 5
 """One validation sample in this many shows no head."""
-HARD_LEVEL_SHARE = {"none": 0.15, "mild": 0.3, "moderate": 0.25, "severe": 0.3}
-"""Probability of each level of motion in hard scans."""
-HARD_VIEW_CUT_SHARE = 0.2
-HARD_WRAP_SHARE = 0.15
-HARD_SHELLS = 4
 
 
 class MaskDataModule(SyntheticDataModule):
@@ -48,9 +42,6 @@ class MaskDataModule(SyntheticDataModule):
         samples_per_epoch: training samples per epoch.
         scans_per_scene: samples made from one scene.
         val_samples: validation samples.
-        hard_share: share of training scenes with more of the cases that a trained network still gets wrong: more round
-            objects in dark shells, heads at the rim of the field of view or under folded-over signal, severe motion.
-            Studies and validation draw scans with the usual shares.
         common: see `SyntheticDataModule`.
 
     Raises:
@@ -67,13 +58,10 @@ class MaskDataModule(SyntheticDataModule):
         samples_per_epoch: int = 384,
         scans_per_scene: int = 16,
         val_samples: int = 40,
-        hard_share: float = 0.0,
         **common: Any,
     ) -> None:
         super().__init__(**common)
         self.check_at_least_one("batch_size", "samples_per_epoch", "scans_per_scene", "val_samples")
-        if not 0 <= hard_share <= 1:
-            raise InputError(f"data.hard_share: {hard_share}; expected 0 to 1")
 
     def make_sets(self) -> tuple[MaskSamples, MaskSamples]:
         """Training samples, which differ from epoch to epoch, and validation samples, which do not."""
@@ -86,9 +74,7 @@ class MaskDataModule(SyntheticDataModule):
             "crop_shape": tuple(h.crop_shape),
         }
         scenes = max(1, h.samples_per_epoch // h.scans_per_scene)
-        return MaskSamples(
-            train, length=h.samples_per_epoch, seed=h.seed, n_scenes=scenes, hard_share=h.hard_share, **shapes
-        ), MaskSamples(
+        return MaskSamples(train, length=h.samples_per_epoch, seed=h.seed, n_scenes=scenes, **shapes), MaskSamples(
             val, length=h.val_samples, seed=h.seed + VALIDATION_SEED, n_scenes=h.val_samples, in_order=True, **shapes
         )
 
@@ -114,7 +100,6 @@ class MaskSamples(SubjectDataset[MaskSample]):
         seed: of the whole dataset.
         n_scenes: per epoch.
         in_order: for validation: subjects in turn, heads without augmentation, and every fifth scan without a head.
-        hard_share: see `MaskDataModule`.
         shapes: see `draw_sample`.
     """
 
@@ -126,11 +111,10 @@ class MaskSamples(SubjectDataset[MaskSample]):
         seed: int,
         n_scenes: int,
         in_order: bool = False,
-        hard_share: float = 0.0,
         **shapes: Any,
     ) -> None:
         super().__init__(subjects, length, seed, in_order)
-        self.n_scenes, self.hard_share, self.shapes = n_scenes, hard_share, shapes
+        self.n_scenes, self.shapes = n_scenes, shapes
         self._scenes: dict[tuple[int, int], Scene] = {}
 
     def make(self, epoch: int, index: int) -> MaskSample:
@@ -140,12 +124,8 @@ class MaskSamples(SubjectDataset[MaskSample]):
             scene = self._new_scene(which, rng)
             headless = self.turn(index, NEGATIVE_EVERY) == NEGATIVE_EVERY - 1
             return draw_sample(draw_scan(scene, rng, headless), rng, **self.shapes)
-        number = index % self.n_scenes
-        scene = self._scene(epoch, number)
-        if not self._is_hard(number):
-            return draw_sample(draw_scan(scene, rng), rng, **self.shapes)
-        scan = draw_scan(scene, rng, view_cut_share=HARD_VIEW_CUT_SHARE, level_share=HARD_LEVEL_SHARE)
-        return draw_sample(scan, rng, **self.shapes, wrap_share=HARD_WRAP_SHARE)
+        scene = self._scene(epoch, index % self.n_scenes)
+        return draw_sample(draw_scan(scene, rng), rng, **self.shapes)
 
     def load(self, subject: Subject) -> TruthVolume:
         """The subject in the atlas frame, its mask filled to the skull."""
@@ -158,32 +138,27 @@ class MaskSamples(SubjectDataset[MaskSample]):
             self._scenes = {k: scene for k, scene in self._scenes.items() if k[0] == epoch}
             rng = np.random.default_rng([self.seed, epoch, number, 1])
             which = int(rng.integers(len(self.subjects)))
-            self._scenes[key] = self._new_scene(which, rng, HARD_SHELLS if self._is_hard(number) else 0)
+            self._scenes[key] = self._new_scene(which, rng)
         return self._scenes[key]
 
-    def _is_hard(self, number: int) -> bool:
-        """Whether a scene of an epoch is a hard one; the hard scenes have the lowest numbers."""
-        return number < round(self.hard_share * self.n_scenes)
-
-    def _new_scene(self, which: int, rng: np.random.Generator, further_shells: int = 0) -> Scene:
+    def _new_scene(self, which: int, rng: np.random.Generator) -> Scene:
         volume = self.volume(which)
         if not self.in_order:
             volume = varied_head(recoloured(volume, rng) if rng.random() < RECOLOURED_SHARE else volume, rng)
-        return new_scene(volume, rng, further_shells)
+        return new_scene(volume, rng)
 
 
-def new_scene(volume: TruthVolume, rng: np.random.Generator, further_shells: int = 0) -> Scene:
+def new_scene(volume: TruthVolume, rng: np.random.Generator) -> Scene:
     """A randomly scaled head in random surroundings.
 
     Args:
         volume: a result of `filled_head`.
         rng: source of randomness.
-        further_shells: see `draw_surroundings`.
     """
     affine = volume.affine.copy()
     affine[:3] *= rng.uniform(*SCALE_RANGE)
     head = scene_head(replace(volume, affine=affine), rng)
-    return Scene(head=head, around=draw_surroundings(head.base_mm, head.radius_mm, rng, further_shells))
+    return Scene(head=head, around=draw_surroundings(head.base_mm, head.radius_mm, rng))
 
 
 def mask_batch(samples: Sequence[MaskSample]) -> dict[str, torch.Tensor]:

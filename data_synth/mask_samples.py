@@ -15,7 +15,6 @@ from data_synth.augment import applied
 from data_synth.mask_scans import Scan
 from g3r.acquisition.axis_resampling import along_axes, axis_weights
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 N_OVERSAMPLED = 2
@@ -63,7 +62,6 @@ def draw_sample(
     wide_shape: tuple[int, int, int],
     pixel_mm: float,
     crop_shape: tuple[int, int, int],
-    wrap_share: float = WRAP_SHARE,
 ) -> MaskSample:
     """A sample of a scan.
 
@@ -74,12 +72,11 @@ def draw_sample(
         wide_shape: pixels and slices of the wide image; a larger scan gives a random part.
         pixel_mm: pixel size of the crop.
         crop_shape: pixels and slices of the crop.
-        wrap_share: share of wide images with signal from outside the field of view folded in.
     """
     wide_image, wide_mask = _wide(scan, rng, wide_mm, wide_shape)
     image, mask = _crop(scan, rng, pixel_mm, crop_shape)
     return MaskSample(
-        wide_image=with_artefacts(wide_image, rng, wrap_share, WIDE_NOISE),
+        wide_image=with_artefacts(wide_image, rng, WRAP_SHARE, WIDE_NOISE),
         wide_mask=wide_mask,
         image=with_artefacts(image, rng),
         mask=mask,

@@ -6,10 +6,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth.slice_sampling import trilinear
+from data_synth.slice_sampling import pixel_lines, trilinear
 from g3r.geometry import RigidPose
-
-Array = NDArray[np.float64]
 
 
 def image_slices(
@@ -47,21 +45,15 @@ def image_slices(
     depth = ((np.arange(n_through) + 0.5) / n_through - 0.5) * thickness_mm
     return _slices(
         head,
-        *_lines(index_from_head, head_pose),
+        *pixel_lines(index_from_head, head_pose),
         behind,
-        *_lines(index_from_scan, scan_pose),
+        *pixel_lines(index_from_scan, scan_pose),
         np.array(first_mm, np.float32),
         np.float32(pixel_mm),
         shape[0],
         shape[1],
         depth.astype(np.float32),
     )
-
-
-def _lines(index_from: NDArray[np.floating], pose: RigidPose) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    linear = index_from[:3, :3]
-    origin = pose.translation_mm @ linear.T + index_from[:3, 3]
-    return np.ascontiguousarray(linear @ pose.rotation, np.float32), np.ascontiguousarray(origin, np.float32)
 
 
 @nb.njit(cache=True, fastmath=True)

@@ -89,16 +89,13 @@ class _Canvas:
             self.put(core, (start + end) / 2, radii * [0.4, 0.4, 0.9], turn)
 
 
-def draw_surroundings(
-    base_mm: Array, radius_mm: float, rng: np.random.Generator, further_shells: int = 0
-) -> Surroundings:
+def draw_surroundings(base_mm: Array, radius_mm: float, rng: np.random.Generator) -> Surroundings:
     """Mother and fetal body about a head at the origin.
 
     Args:
         base_mm: [3] start of the neck.
         radius_mm: of the head.
         rng: source of randomness.
-        further_shells: largest number of additional head-sized round objects in a dark shell.
     """
     r = radius_mm
     bend = Rotation.from_rotvec([rng.uniform(-0.2, 1.0), 0, rng.normal(0, 0.3)]).as_matrix()
@@ -110,11 +107,6 @@ def draw_surroundings(
     mother, uterus = _mother(canvas, middle, down, r, rng)
     for _ in range(int(rng.integers(4, 14))):
         _maternal_body(canvas, middle, mother, rng)
-    if further_shells:  # no random number is drawn without them, so that the scenes of existing seeds do not change
-        for _ in range(int(rng.integers(further_shells + 1))):
-            at = mother[0] + mother[2] @ (rng.uniform(-0.8, 0.8, 3) * mother[1])
-            radius = radius_mm * rng.uniform(0.5, 1.1) * rng.uniform(0.85, 1.15, 3)
-            _shell(canvas, at, radius, Rotation.random(rng=rng).as_matrix(), rng)
     _uterus(canvas, uterus, r, rng)
     canvas.put(Tissue.FETAL_BODY, trunk, size, bend)
     if rng.random() < 0.7:  # bowel, kidneys and other organs: as heterogeneous as a brain

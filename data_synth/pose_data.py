@@ -19,6 +19,8 @@ from data_synth.subject_dataset import SubjectDataset
 from data_synth.template import atlas_templates
 from data_synth.trajectories import RecordedTrajectory, load_trajectories
 from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.slice_images import batch_arrays
+from g3r.geometry import RigidPose
 
 HEAD_SPACING_MM = 2.0
 """Voxel size of the truth volume, smaller than the pixels of the slices."""
@@ -158,21 +160,9 @@ class SliceSets(SubjectDataset[SliceSet]):
 
 
 def slice_set_batch(sets: Sequence[SliceSet]) -> dict[str, torch.Tensor]:
-    """The slices of several heads as one dict of tensors, with their true poses.
-
-    Keys: `image` [S, 1, N, N], `area_mm2`, `position_mm`, `thickness_mm`, `time_rank` [S], `stack` [S]
-    (numbered consecutively over all heads), `set_of_stack` [G], `header_rotation` and `true_rotation` [S, 3, 3],
-    `true_translation_mm` [S, 3].
-    """
-    batch: dict[str, np.ndarray] = {
-        name: np.concatenate([getattr(one.images, name) for one in sets]).astype(np.float32)
-        for name in ("image", "area_mm2", "position_mm", "thickness_mm", "time_rank", "header_rotation")
-    }
-    batch["image"] = batch["image"][:, None]
-    batch["true_rotation"] = np.concatenate([s.true_pose.rotation for s in sets]).astype(np.float32)
-    batch["true_translation_mm"] = np.concatenate([s.true_pose.translation_mm for s in sets]).astype(np.float32)
-    n_stacks = [int(one.images.stack_id.max()) + 1 for one in sets]
-    first = np.cumsum([0, *n_stacks])
-    batch["stack"] = np.concatenate([one.images.stack_id + first[k] for k, one in enumerate(sets)])
-    batch["set_of_stack"] = np.repeat(np.arange(len(sets)), n_stacks)
+    """A `SliceBatch` of several heads, with `true_rotation` [S, 3, 3] and `true_translation_mm` [S, 3]."""
+    batch = batch_arrays([one.images for one in sets])
+    true = RigidPose.concatenated([one.true_pose for one in sets])
+    batch["true_rotation"] = true.rotation.astype(np.float32)
+    batch["true_translation_mm"] = true.translation_mm.astype(np.float32)
     return {name: torch.from_numpy(value) for name, value in batch.items()}

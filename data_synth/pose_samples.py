@@ -46,7 +46,6 @@ def draw_slice_set(
     max_slices: int = 64,
     n_stacks: int | None = None,
     recorded: Sequence[RecordedTrajectory] = (),
-    vary: bool = True,
 ) -> SliceSet:
     """A random slice set of a head: stacks are planned, moved and sliced; shape and intensities are varied.
 
@@ -58,14 +57,13 @@ def draw_slice_set(
         max_slices: of all stacks together; a larger set is thinned, and the excess dropped at random.
         n_stacks: None draws 1 to 6.
         recorded: trajectories to follow instead of the model's.
-        vary: False keeps shape and intensities, without noise, gain or dropout.
     """
-    shape = _random_shape(rng) if vary else np.eye(3)
+    shape = _random_shape(rng)
     index_from_atlas = np.linalg.inv(head.affine) @ _homogeneous(np.linalg.inv(shape))
     corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(head.data.shape) - 1)
     corners = (corners @ head.affine[:3, :3].T + head.affine[:3, 3]) @ shape.T
     plan = draw_stacks(corners, rng, n_stacks, recorded)
-    threshold = float(rng.uniform(0.3, 0.6)) if vary else 0.5
+    threshold = float(rng.uniform(0.3, 0.6))
 
     # coarse masks of the moved slices, which the header poses then place
     look = sample_masks(head, index_from_atlas, plan.true_pose, LOOK_PIXEL_MM, LOOK_SIZE, threshold)
@@ -78,8 +76,7 @@ def draw_slice_set(
     frame = RigidPose.from_rotvec(np.zeros_like(translation_mm), translation_mm * [1, 1, 0])
     true = plan.true_pose @ frame
     image, inside = sample_slices(head, index_from_atlas, true, plan.thickness_mm, pixel_mm, size, threshold)
-    if vary:
-        image = _random_intensities(image, inside, true, pixel_mm, rng)
+    image = _random_intensities(image, inside, true, pixel_mm, rng)
     bright = np.percentile(image[inside > 0.5], 99) if (inside > 0.5).any() else 1.0
     images = SliceImages(
         image=(image / max(bright, 1e-6)).astype(np.float32),

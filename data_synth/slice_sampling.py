@@ -65,14 +65,10 @@ def sample_slices(
     Returns:
         Images [K, N, N], zero outside the mask, and the mask's share of each pixel [K, N, N].
     """
-    linear = index_from_atlas[:3, :3]
-    axes = linear @ pose.rotation
-    origin = pose.translation_mm @ linear.T + index_from_atlas[:3, 3]
     return _sample(
         head.data,
         head.soft_mask,
-        np.ascontiguousarray(axes, dtype=np.float32),
-        np.ascontiguousarray(origin, dtype=np.float32),
+        *pixel_lines(index_from_atlas, pose),
         np.asarray(thickness_mm, dtype=np.float32),
         np.float32(pixel_mm),
         size,
@@ -98,10 +94,23 @@ def sample_masks(
     Returns:
         [K, N, N], 0 or 1.
     """
-    linear = index_from_atlas[:3, :3]
-    axes = np.ascontiguousarray(linear @ pose.rotation, dtype=np.float32)
-    origin = np.ascontiguousarray(pose.translation_mm @ linear.T + index_from_atlas[:3, 3], dtype=np.float32)
-    return _sample_mask(head.soft_mask, axes, origin, np.float32(pixel_mm), size, np.float32(threshold))
+    lines = pixel_lines(index_from_atlas, pose)
+    return _sample_mask(head.soft_mask, *lines, np.float32(pixel_mm), size, np.float32(threshold))
+
+
+def pixel_lines(index_from: NDArray[np.floating], pose: RigidPose) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A slice's axes and origin in the voxel index of a grid, as the compiled loops take them.
+
+    Args:
+        index_from: [4, 4] voxel index from the frame of the poses (mm).
+        pose: [K] that frame from the slices.
+
+    Returns:
+        Columns per mm along each axis of a slice [K, 3, 3], and origins [K, 3].
+    """
+    linear = index_from[:3, :3]
+    origin = pose.translation_mm @ linear.T + index_from[:3, 3]
+    return np.ascontiguousarray(linear @ pose.rotation, np.float32), np.ascontiguousarray(origin, np.float32)
 
 
 @nb.njit(cache=True, fastmath=True)

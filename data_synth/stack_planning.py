@@ -105,8 +105,8 @@ def draw_stacks(
         stacks.append((pose, motion @ pose, time_rank if order_known else np.full(len(z), np.nan)))
     n_slices = [len(pose) for pose, _, _ in stacks]
     return PlannedSlices(
-        header_pose=_joined([header for header, _, _ in stacks]),
-        true_pose=_joined([true for _, true, _ in stacks]),
+        header_pose=RigidPose.concatenated([header for header, _, _ in stacks]),
+        true_pose=RigidPose.concatenated([true for _, true, _ in stacks]),
         thickness_mm=np.full(sum(n_slices), thickness),
         time_rank=np.concatenate([rank for _, _, rank in stacks]),
         stack_id=np.repeat(np.arange(n_stacks), n_slices),
@@ -130,7 +130,3 @@ def planned_rotation(axis: int, rng: np.random.Generator) -> Array:
     tilt = Rotation.from_rotvec(rng.normal(0, PLAN_TILT_DEG, 3), degrees=True).as_matrix()
     in_plane = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     return tilt @ base @ in_plane
-
-
-def _joined(poses: Sequence[RigidPose]) -> RigidPose:
-    return RigidPose(np.concatenate([p.rotation for p in poses]), np.concatenate([p.translation_mm for p in poses]))

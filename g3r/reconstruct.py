@@ -12,7 +12,7 @@ from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
-from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.lattice_mean import fit_lattices
 from g3r.fitting.mask_agreement import REFINED
 from g3r.fitting.observer import FitObserver
@@ -30,7 +30,7 @@ from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
 from g3r.registration import GivenPoses, Registration, RegistrationSettings, register_robustly
 from g3r.registration.atlas_search import template_fits
-from g3r.registration.given import measure
+from g3r.registration.given import measure, with_pixels_of
 from g3r.registration.quality import unknown_orientation_note
 from g3r.report.reported_result import ReportedResult
 from g3r.run.context import RunContext

@@ -18,7 +18,7 @@ from g3r.acquisition.planes import Slices
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import Comparison, compare
 from g3r.evaluation.metrics import Scores
-from g3r.evaluation.pose_error import PoseError, SliceKey
+from g3r.evaluation.pose_error import PoseError, PoseTable, SliceKey, target_registration_error
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
@@ -36,6 +36,12 @@ OFF_MM, BAD_OFF_SHARE = 2.0, 0.05
 """A volume is unreliable if more than BAD_OFF_SHARE of the brain in its slices is misplaced by more than OFF_MM."""
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+def header_error(case: SimulatedCase) -> PoseError:
+    """Error of the header poses of a subject."""
+    still = RigidPose.identity(len(case.true.keys))
+    return target_registration_error(case.points_mm, case.true, PoseTable(case.true.keys, still))
 
 
 def run(

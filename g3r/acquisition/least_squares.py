@@ -58,9 +58,9 @@ def solve_volume(
     value: NDArray[np.float32],
     weight: NDArray[np.float32],
     *,
+    smoothness: float,
     start: NDArray[np.float32] | None = None,
     n_iterations: int = 8,
-    smoothness: float = 0.02,
 ) -> NDArray[np.float32]:
     """Minimise sum_p weight_p (A V - value)_p^2 + s ||grad V||^2 over volumes V [I, J, K].
 
@@ -71,9 +71,9 @@ def solve_volume(
         operator: voxel forward operator for the P' pixels.
         value: [P'] intensities.
         weight: [P'] non-negative.
+        smoothness: weight of squared differences of neighbouring voxels.
         start: volume to start from; zero when None.
         n_iterations: number of conjugate-gradient steps.
-        smoothness: weight of squared differences of neighbouring voxels.
     """
     seen = operator.adjoint(weight.astype(np.float32))
     typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +52,23 @@ class SliceImages:
 
     def __len__(self) -> int:
         return len(self.image)
+
+
+def batch_arrays(sets: Sequence[SliceImages]) -> dict[str, NDArray[Any]]:
+    """The slices of several heads as the arrays of one batch, at inference and in training.
+
+    Stacks are numbered across all heads. `g3r.pose_network.network.SliceBatch` lists names and shapes.
+    """
+    batch: dict[str, NDArray[Any]] = {
+        name: np.concatenate([getattr(one, name) for one in sets]).astype(np.float32)
+        for name in ("image", "area_mm2", "position_mm", "thickness_mm", "time_rank", "header_rotation")
+    }
+    batch["image"] = batch["image"][:, None]
+    n_stacks = [int(one.stack_id.max()) + 1 for one in sets]
+    first = np.cumsum([0, *n_stacks])
+    batch["stack"] = np.concatenate([one.stack_id + first[k] for k, one in enumerate(sets)])
+    batch["set_of_stack"] = np.repeat(np.arange(len(sets)), n_stacks)
+    return batch
 
 
 def slice_images(slices: Slices, pixel_mm: float, size: int) -> SliceImages:

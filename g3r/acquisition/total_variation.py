@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.kernels_voxels import fill_divergence
 
-Array = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
 
 
-def diffusivity(volume: Array, tip: float) -> Array:
+def diffusivity(volume: Float32Array, tip: float) -> Float32Array:
     """1 / (2 |grad V|) of total variation with a rounded tip [I, J, K].
 
     Args:
@@ -27,7 +27,7 @@ def diffusivity(volume: Array, tip: float) -> Array:
     return (0.5 / np.sqrt(squares + np.float32(tip) ** 2)).astype(np.float32)
 
 
-def divergence_of_gradient(volume: Array, weight: Array | None) -> Array:
+def divergence_of_gradient(volume: Float32Array, weight: Float32Array | None) -> Float32Array:
     """D^T W D V with forward differences D, free edges, and the weights W [I, J, K] of voxels (None: 1)."""
     out = np.empty_like(volume)
     fill_divergence(volume, np.ones((1, 1, 1), volume.dtype) if weight is None else weight, weight is not None, out)

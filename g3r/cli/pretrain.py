@@ -50,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         from lightning.pytorch import LightningDataModule, Trainer
         from lightning.pytorch.cli import LightningCLI
 
-        from g3r.training.annealed_module import AnnealedModule, WholeCheckpoints
+        from g3r.training.annealed_module import AnnealedModule
+        from g3r.training.whole_checkpoints import WholeCheckpoints
     except KeyboardInterrupt:
         return fail(PROG, CUT_SHORT, INTERRUPTED)
     except ModuleNotFoundError as error:

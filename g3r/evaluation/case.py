@@ -54,11 +54,6 @@ class SimulatedCase:
         """The mask of the true volume."""
         return load_mask(self.folder / "truth-mask.nii.gz", self.truth)
 
-    def header_error(self) -> PoseError:
-        """Error of the header poses."""
-        still = RigidPose.identity(len(self.true.keys))
-        return target_registration_error(self.points_mm, self.true, PoseTable(self.true.keys, still))
-
     def pose_error(self, slices: Slices) -> PoseError:
         """Error of the current poses of slices of these stacks."""
         return target_registration_error(self.points_mm, self.true, pose_table(slices))

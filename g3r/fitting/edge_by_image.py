@@ -21,7 +21,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.slice_stage import SliceFit
-from g3r.fitting.voxel_problem import Array, FitPixels, VoxelProblem, VoxelProblemSettings, too_fine
+from g3r.fitting.voxel_problem import FitPixels, Float32Array, VoxelProblem, VoxelProblemSettings, too_fine
 from g3r.geometry import VolumeGrid
 
 SHARES = (0.2, 0.5)
@@ -58,13 +58,13 @@ LEAST_PREDICTED = 0.1
 
 
 def shown_by_image(
-    volume: Array,
+    volume: Float32Array,
     edge: NDArray[np.floating],
     support: NDArray[np.bool_],
     grid: VolumeGrid,
     fit: SliceFit,
     acquired: Slices,
-) -> Array | None:
+) -> Float32Array | None:
     """How much of the volume is to be shown [I, J, K]; None if something lies beside the brain, or voxels are too fine.
 
     Args:
@@ -94,13 +94,13 @@ def shown_by_image(
     return np.where(depth_mm > FULL_MM, 1, shown).astype(np.float32)
 
 
-def _depth_mm(support: NDArray[np.bool_], grid: VolumeGrid) -> Array:
+def _depth_mm(support: NDArray[np.bool_], grid: VolumeGrid) -> Float32Array:
     """Distance [I, J, K] from the edge of the support, positive inside."""
     inside, outside = (distance_transform_edt(part, sampling=grid.spacing_mm) for part in (support, ~support))
     return (inside - outside).astype(np.float32)
 
 
-def _around(fit: SliceFit, acquired: Slices, depth_mm: Array, grid: VolumeGrid) -> FitPixels | None:
+def _around(fit: SliceFit, acquired: Slices, depth_mm: Float32Array, grid: VolumeGrid) -> FitPixels | None:
     """Pixels near the edge, masked or not; None if something lies beside the brain, or if no pixel shows it."""
     slices = replace(fit.slices, value=acquired.value, mask=np.ones_like(acquired.mask))
     pixels = FitPixels.of(fit, slices, np.ones(len(slices.value), np.float32))
@@ -119,7 +119,9 @@ def _around(fit: SliceFit, acquired: Slices, depth_mm: Array, grid: VolumeGrid) 
     return pixels.take((depth > -OUTSIDE_MM) & (depth < INSIDE_MM))
 
 
-def _continued(volume: Array, edge: NDArray[np.floating], depth_mm: Array, grid: VolumeGrid) -> Array:
+def _continued(
+    volume: Float32Array, edge: NDArray[np.floating], depth_mm: Float32Array, grid: VolumeGrid
+) -> Float32Array:
     """The volume [I, J, K] as if it had no edge."""
     counts = np.where(depth_mm > 0, edge, 0).astype(np.float32)
     width = CONTINUED_MM / grid.spacing_mm

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.fitting.best_gains import best_gains
 from g3r.gaussians import GaussianCloud, render
 
 STRETCHES = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)
@@ -54,12 +55,10 @@ class HeldOutFit:
         number = planes.plane_id()[index]
         planes = replace(planes, psf_var_mm2=planes.psf_var_mm2 * np.array([1, 1, stretch**2]))
         predicted, measured = render(self.cloud, planes).numpy()[index] * self.field, self.slices.value[index]
-        across = np.bincount(number, self.share * predicted * measured)
-        own = np.bincount(number, self.share * predicted * predicted)
-        gain = np.divide(across, own, out=np.ones_like(own), where=own > 0)
+        gain = best_gains(self.share, predicted, measured, number, len(self.slices), of_nothing=1)
+        off: NDArray[np.float64] = np.abs(gain[number] * predicted - measured)
         # times the share, by which the pixel was divided when its surroundings were taken out
-        off: NDArray[np.float64] = self.share * np.abs(gain[number] * predicted - measured)
-        return off
+        return self.share * off
 
     def relative_widths(self, stack_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Width of each stack's profile [N], through the plane, over that of the fit; their geometric mean is 1.

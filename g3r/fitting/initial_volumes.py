@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,7 @@ from g3r.acquisition.coverage import brain_share
 from g3r.acquisition.foreground import Foreground, Votes
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
-from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
-from g3r.registration import Registration
 
 MARGIN_MM = 5.0
 """Margin of the prior's grid around the masked pixels."""
@@ -148,36 +146,3 @@ class PriorVolume:
     gain: NDArray[np.float64]
     scale: float
     accepted: bool | None = None
-
-
-def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
-    """A registration whose slices have the pixels of the slices to be fitted.
-
-    Raises:
-        InputError: the two are not about the same slices.
-    """
-    found = registration.slices
-    slices = slices.take(~np.isin(slices.stack_id, [n for n, _ in registration.left_out]))
-    if not (np.array_equal(found.stack_id, slices.stack_id) and np.array_equal(found.slice_index, slices.slice_index)):
-        raise InputError(
-            f"registration of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
-            "register the same stacks with the same masks"
-        )
-    return replace(registration, slices=slices.with_pose(found.planes.pose))
-
-
-@dataclass(frozen=True, kw_only=True)
-class LatticeSpacing:
-    """Spacing of the lattice of Gaussians.
-
-    Args:
-        pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers.
-        at_most_mm: upper bound of that edge in mm, whatever the pixels: the cortex is as thick in thick slices.
-    """
-
-    pixels: float
-    at_most_mm: float
-
-    def mm(self, slices: Slices) -> float:
-        """Cell edge per Gaussian for the median pixel of some slices."""
-        return min(self.pixels * slices.typical_pixel_mm, self.at_most_mm)

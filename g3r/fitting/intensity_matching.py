@@ -27,7 +27,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.neighbour_gains import MIN_INTENSITY, neighbour_gains
 
-Array = NDArray[np.float64]
+Float64Array = NDArray[np.float64]
 
 VOXEL_MM = 2.5
 """About the slice thickness: what differs between slices that cross within a voxel is mostly gain and field."""
@@ -63,11 +63,11 @@ class MatchedIntensities:
     """
 
     slices: Slices
-    gain: Array
+    gain: Float64Array
     coefficients: list[list[float]]
 
 
-def match_intensities(slices: Slices, gain: Array, weight: NDArray[np.floating]) -> MatchedIntensities:
+def match_intensities(slices: Slices, gain: Float64Array, weight: NDArray[np.floating]) -> MatchedIntensities:
     """Gains and fields from slices in place.
 
     Args:
@@ -101,8 +101,8 @@ def match_intensities(slices: Slices, gain: Array, weight: NDArray[np.floating])
 class _Factors:
     """log_gain [K] of the slices and coefficients [N, 5] of the fields of their stacks."""
 
-    log_gain: Array
-    coefficients: Array
+    log_gain: Float64Array
+    coefficients: Float64Array
 
 
 class _Pixels:
@@ -133,7 +133,7 @@ class _Pixels:
             self.alike[rows] /= max(float(self.alike[rows].sum()), 1e-30)
         self.shading = self._shared_shading(slices.planes.pixel_world_mm(index) / LENGTH_MM)
 
-    def _shared_shading(self, place: Array) -> Array:
+    def _shared_shading(self, place: Float64Array) -> Float64Array:
         """Quadratics of places [P', 3] that gains and fields can show in every stack: [P', n], orthonormal."""
         place = place - np.average(place, axis=0, weights=self.alike)
         terms = np.column_stack([place, *(place[:, i] * place[:, j] for i in range(3) for j in range(i, 3))])
@@ -143,18 +143,18 @@ class _Pixels:
         share, mode = eigh((left.T * self.alike) @ left, whole + 1e-6 * np.trace(whole) * np.eye(len(whole)))
         return np.asarray(terms @ mode[:, share < SHARED])
 
-    def of(self, factors: _Factors) -> Array:
+    def of(self, factors: _Factors) -> Float64Array:
         """The sum of gains and fields [P'] at each pixel."""
         own = factors.coefficients[self.stack[self.plane]]
         return factors.log_gain[self.plane] + np.einsum("pi,pi->p", own, self.terms)
 
-    def off(self, factors: _Factors) -> Array:
+    def off(self, factors: _Factors) -> Float64Array:
         """Log-intensities [P'] relative to the volume that pixels give with these factors."""
         volume = self.operator.adjoint((self.weight * (self.log_value - self.of(factors))).astype(np.float32))
         np.divide(volume, self.seen, out=volume, where=self.seen > 0)
         return self.log_value - self.operator.forward(volume)
 
-    def agreement(self, left: Array) -> Array:
+    def agreement(self, left: Float64Array) -> Float64Array:
         """Weight [P'] of pixels by their place: one over the mean square of residuals there, usually 1.
 
         Slices disagree at edges, most of all in the rim of skull and fluid that manual masks include.
@@ -165,11 +165,11 @@ class _Pixels:
         usual = float(np.median(variance))
         return usual / np.maximum(variance, MIN_VARIANCE * usual + 1e-12)
 
-    def fitted(self, values: Array, weight: Array) -> _Factors:
+    def fitted(self, values: Float64Array, weight: Float64Array) -> _Factors:
         """Weighted least squares to values [P']: a constant for each slice, the terms of a field for each stack."""
         total = np.maximum(np.bincount(self.plane, weight, self.n_slices), 1e-30)
 
-        def mean(of: Array) -> Array:
+        def mean(of: Float64Array) -> Float64Array:
             return np.bincount(self.plane, weight * of, self.n_slices) / total
 
         mean_value, mean_terms = mean(values), np.column_stack([mean(term) for term in self.terms.T])

@@ -16,7 +16,7 @@ from scipy.linalg import solve
 from g3r.acquisition.bias_basis import stacks_by_header
 from g3r.acquisition.planes import Slices
 
-Array = NDArray[np.float64]
+Float64Array = NDArray[np.float64]
 
 MIN_PIXELS = 50
 """Fewest pixels that two neighbours must share to be compared."""
@@ -33,7 +33,7 @@ MIN_INTENSITY = 0.1
 MAX_ROUNDS = 20
 
 
-def neighbour_gains(slices: Slices) -> Array:
+def neighbour_gains(slices: Slices) -> Float64Array:
     """Intensity factors [K] of slices of one stack, with a geometric mean of 1.
 
     Args:
@@ -63,7 +63,7 @@ def neighbour_gains(slices: Slices) -> Array:
     return np.asarray(np.exp(log_gain - log_gain.mean()))
 
 
-def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
+def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Float64Array]]:
     """For each slice the places of its masked pixels in the stack's plane, as numbers, and their log-intensities.
 
     Slices of one file share a lattice of pixels. Others may lie half a pixel apart. With an offset of a quarter neither
@@ -80,7 +80,7 @@ def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
     return [(number[plane == k], value[plane == k]) for k in range(len(slices))]
 
 
-def _usual(difference: Array) -> float:
+def _usual(difference: Float64Array) -> float:
     """The most frequent difference: the centre of a Cauchy distribution of width `SCALE`."""
     centre = float(np.median(difference))
     for _ in range(MAX_ROUNDS):

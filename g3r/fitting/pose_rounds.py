@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
 from g3r.acquisition.robust import robust_width, slice_weights
-from g3r.fitting.initial_volumes import LatticeSpacing, PriorVolume
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceModel, slice_target
 from g3r.gaussians import render
+from g3r.gaussians.seeding import LatticeSpacing
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
 from g3r.registration.motion_shear import without_excess_shear

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from g3r.errors import InputError
 
+HOLD, FLOOR = 0.4, 0.05
+"""Fraction of a fit up to which steps have their full size, and their size at its end over the full one."""
+
 
 @dataclass(frozen=True)
 class AnnealedWeight:
@@ -41,18 +44,12 @@ class AnnealedWeight:
         return self.start + along * (self.end - self.start)
 
 
-def cosine_decay(fraction: float, hold: float = 0.4, floor: float = 0.05) -> float:
-    """Step size factor: 1 until `hold`, then half a cosine down to `floor` at the end.
-
-    Args:
-        fraction: of the steps that are done, in [0, 1].
-        hold: fraction up to which the factor is 1.
-        floor: factor at the end.
-    """
-    if fraction < hold:
+def cosine_decay(fraction: float) -> float:
+    """Step size factor at a fraction of a fit: 1 until `HOLD`, then half a cosine down to `FLOOR` at the end."""
+    if fraction < HOLD:
         return 1.0
-    along = (fraction - hold) / (1 - hold)
-    return floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * along))
+    along = (fraction - HOLD) / (1 - HOLD)
+    return FLOOR + (1 - FLOOR) * 0.5 * (1 + math.cos(math.pi * along))
 
 
 def prior_strength(schedule: AnnealedWeight, prior_error: float, fraction: float, residual: float) -> float:

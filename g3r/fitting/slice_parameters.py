@@ -13,7 +13,7 @@ from g3r.fitting.objective import TermLoss
 from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
-from g3r.gaussians.render import right_jacobian
+from g3r.geometry.rigid import right_jacobian
 from g3r.registration.open_strain import mean_normals, open_strain
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.best_gains import best_gains
 from g3r.fitting.bias_field import StackBiasField
 from g3r.geometry import VolumeGrid
 
@@ -122,32 +123,12 @@ def _residuals(
     for volume in volumes:
         shown = predicted = operator.forward(volume).astype(np.float64)
         for _ in range(N_ROUNDS):
-            gain = _gains(shown, measured, counts, number, len(slices))
-            shown = predicted * _fields(gain * predicted, measured, counts, stack_id, terms)
-        fitted = _gains(shown, measured, counts, number, len(slices)) * shown
+            gain = best_gains(counts, shown, measured, number, len(slices), of_nothing=0)
+            shown = predicted * _fields(gain[number] * predicted, measured, counts, stack_id, terms)
+        fitted = best_gains(counts, shown, measured, number, len(slices), of_nothing=0)[number] * shown
         error = counts @ (fitted - measured) ** 2
         found.append(round(math.sqrt(error / all_of_it), 4) if all_of_it > 0 else 0.0)
     return found
-
-
-def _gains(
-    predicted: NDArray[np.float64],
-    measured: NDArray[np.float64],
-    counts: NDArray[np.float64],
-    number: NDArray[np.integer],
-    n_slices: int,
-) -> NDArray[np.float64]:
-    """The best gain of its slice for each pixel [P]; 0 where a volume shows nothing.
-
-    Args:
-        predicted: intensities [P].
-        measured: intensities [P].
-        counts: weights [P].
-        number: of the slice of each pixel [P].
-        n_slices: in all.
-    """
-    across, own = (np.bincount(number, counts * predicted * one, n_slices) for one in (measured, predicted))
-    return np.divide(across, own, where=own > 0, out=np.zeros_like(own))[number]
 
 
 def _fields(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from g3r.fitting.slice_stage import SliceFit
-from g3r.fitting.voxel_problem import Array, FitPixels, VoxelProblem, VoxelProblemSettings
+from g3r.fitting.voxel_problem import FitPixels, Float32Array, VoxelProblem, VoxelProblemSettings
 from g3r.geometry import VolumeGrid
 
 PROBE_SIGMA_MM, KEPT_SIGMA_MM = 0.4, 3.2
@@ -60,16 +60,16 @@ class VoxelCorrection:
     """
 
     values: NDArray[np.float16]
-    kept: Array
+    kept: Float32Array
     record: VoxelCorrectionRecord
 
 
 def correct_on_voxels(
-    volume: Array,
+    volume: Float32Array,
     fit: SliceFit,
-    pixel_weight: Array,
+    pixel_weight: Float32Array,
     grid: VolumeGrid,
-    reach: Array,
+    reach: Float32Array,
     settings: VoxelCorrectionSettings,
     rng: np.random.Generator,
 ) -> VoxelCorrection:
@@ -98,7 +98,7 @@ def correct_on_voxels(
     )
 
 
-def _kept(problem: VoxelProblem, found: Array, rng: np.random.Generator) -> Array:
+def _kept(problem: VoxelProblem, found: Float32Array, rng: np.random.Generator) -> Float32Array:
     """Share [I, J, K] of a small change of V_0 that stays in V, with the edges of V."""
     grid = problem.grid
     change = gaussian_filter(rng.standard_normal(grid.shape), PROBE_SIGMA_MM / grid.spacing_mm)

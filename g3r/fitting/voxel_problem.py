@@ -19,11 +19,12 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 from g3r.acquisition.total_variation import diffusivity, divergence_of_gradient
 from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.best_gains import best_gains
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.slice_stage import SliceFit
 from g3r.geometry import VolumeGrid
 
-Array = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
 
 FINE_VOXEL, TOO_FINE_VOXEL = 0.6, 0.5
 """Voxel over pixel size, twice. Below the first, voxels may lie between pixels that are read along their normals alone,
@@ -83,11 +84,11 @@ class FitPixels:
     slices: Slices
     index: NDArray[np.int64]
     plane: NDArray[np.integer]
-    value: Array
-    weight: Array
+    value: Float32Array
+    weight: Float32Array
 
     @classmethod
-    def of(cls, fit: SliceFit, slices: Slices, pixel_weight: Array) -> FitPixels:
+    def of(cls, fit: SliceFit, slices: Slices, pixel_weight: Float32Array) -> FitPixels:
         """The masked pixels of slices of a fit, or of the same slices with other values or masks.
 
         Args:
@@ -113,20 +114,19 @@ class FitPixels:
         in_plane = 3 if float(grid.spacing_mm.min()) / pixel_mm < FINE_VOXEL else 1
         return VoxelOperator(self.slices.planes, grid, self.index, (in_plane, in_plane, 5))
 
-    def error(self, volume: Array, grid: VolumeGrid) -> float:
+    def error(self, volume: Float32Array, grid: VolumeGrid) -> float:
         """Root mean square error of what a volume [I, J, K] predicts, after a gain for each slice."""
         off = self._off(volume, grid)
         return float(np.sqrt((self.weight * off**2).sum() / max(float(self.weight.sum()), 1e-30)))
 
-    def noise(self, volume: Array, grid: VolumeGrid) -> float:
+    def noise(self, volume: Float32Array, grid: VolumeGrid) -> float:
         """Robust standard deviation of these errors, in which edges that the volume shows too soft hardly count."""
         counts = self.weight > 0.5 * self.weight.max(initial=0)
         return robust_width(self._off(volume, grid)[counts]) if counts.any() else 0.0
 
-    def _off(self, volume: Array, grid: VolumeGrid) -> NDArray[np.float64]:
-        predicted, n = self.operator(grid).forward(volume), len(self.slices)
-        across, own = (np.bincount(self.plane, self.weight * predicted * one, n) for one in (self.value, predicted))
-        gain = np.divide(across, own, out=np.ones(n), where=own > 0)
+    def _off(self, volume: Float32Array, grid: VolumeGrid) -> NDArray[np.float64]:
+        predicted = self.operator(grid).forward(volume)
+        gain = best_gains(self.weight, predicted, self.value, self.plane, len(self.slices), of_nothing=1)
         return gain[self.plane] * predicted - self.value
 
 
@@ -146,7 +146,7 @@ class VoxelProblem:
         typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0
         self.hold, self.strength = (np.float32(typical * one) for one in (settings.hold, settings.total_variation))
 
-    def solved(self, volume: Array) -> Array:
+    def solved(self, volume: Float32Array) -> Float32Array:
         """V [I, J, K] for V_0 [I, J, K]."""
         target = self.operator.adjoint(self.pixels.weight * self.pixels.value) + self.hold * volume
         found = volume
@@ -154,11 +154,11 @@ class VoxelProblem:
             found = self.solve(target, found, self.edges(found))
         return found
 
-    def edges(self, volume: Array) -> Array:
+    def edges(self, volume: Float32Array) -> Float32Array:
         """Weights of total variation by the edges of a volume [I, J, K], for `solve`."""
         return diffusivity(volume, self.settings.tip) + np.float32(self.settings.squares)
 
-    def solve(self, target: Array, start: Array, edges: Array) -> Array:
+    def solve(self, target: Float32Array, start: Float32Array, edges: Float32Array) -> Float32Array:
         """One solution of the normal equations with given weights of total variation.
 
         Args:
@@ -167,7 +167,7 @@ class VoxelProblem:
             edges: [I, J, K] of `edges`.
         """
 
-        def normal(flat: NDArray[np.floating]) -> Array:
+        def normal(flat: NDArray[np.floating]) -> Float32Array:
             volume = flat.reshape(self.grid.shape).astype(np.float32)
             data = self.operator.adjoint(self.pixels.weight * self.operator.forward(volume).astype(np.float32))
             held = self.hold * volume + self.strength * divergence_of_gradient(volume, edges)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
@@ -100,20 +98,3 @@ def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
     change = twist.detach().double().numpy()
     rotation = planes.rotation @ Rotation.from_rotvec(change[:, :3]).as_matrix()
     return planes.with_pose(RigidPose(rotation, planes.center_mm + change[:, 3:]))
-
-
-def right_jacobian(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Right Jacobian of SO(3) [K, 3, 3]: exp(w + dw) = exp(w) exp(J_r(w) dw) to first order.
-
-    Source: Sola et al., A micro Lie theory (2018), Eq. 143. Series below 1e-4 rad, where the closed form
-    loses digits.
-    """
-    angle = np.linalg.norm(rotvec_rad, axis=1)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    x, y, z = rotvec_rad.T
-    zero = np.zeros_like(x)
-    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    return np.eye(3) - first[:, None, None] * skew + second[:, None, None] * (skew @ skew)

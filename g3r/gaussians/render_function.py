@@ -14,7 +14,8 @@ from g3r.gaussians import kernels, kernels_backward
 from g3r.gaussians.arrays import CloudArrays, PlaneArrays, Workspace
 from g3r.gaussians.cloud import GaussianCloud
 from g3r.gaussians.overlap import OverlapList
-from g3r.gaussians.render import moved_planes, right_jacobian
+from g3r.gaussians.render import moved_planes
+from g3r.geometry.rigid import right_jacobian
 
 
 class RenderFunction(torch.autograd.Function):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from g3r.acquisition.planes import Slices
 from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
 from g3r.run.on_demand import torch
@@ -18,6 +20,23 @@ SCALE_PER_SPACING = 0.6
 
 MAX_ANISOTROPY = 1.6
 """Largest ratio of a seed's sigma to that of a round one of equal volume."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatticeSpacing:
+    """Spacing of the lattice of Gaussians.
+
+    Args:
+        pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers.
+        at_most_mm: upper bound of that edge in mm, whatever the pixels: the cortex is as thick in thick slices.
+    """
+
+    pixels: float
+    at_most_mm: float
+
+    def mm(self, slices: Slices) -> float:
+        """Cell edge per Gaussian for the median pixel of some slices."""
+        return min(self.pixels * slices.typical_pixel_mm, self.at_most_mm)
 
 
 def seed_cloud(

@@ -120,6 +120,28 @@ def rotation_matrix(rotvec_rad: ArrayLike) -> NDArray[np.float64]:
     return matrices.reshape(*vectors.shape[:-1], 3, 3)
 
 
+def skew(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices [K, 3, 3] of the cross products with vectors [K, 3], a x."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def right_jacobian(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Right Jacobian of SO(3) [K, 3, 3]: exp(w + dw) = exp(w) exp(J_r(w) dw) to first order.
+
+    Source: Sola et al., A micro Lie theory (2018), Eq. 143. Series below 1e-4 rad, where the closed form
+    loses digits.
+    """
+    angle = np.linalg.norm(rotvec_rad, axis=1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    cross = skew(rotvec_rad)
+    return np.eye(3) - first[:, None, None] * cross + second[:, None, None] * (cross @ cross)
+
+
 def orthonormal(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """The rotations nearest to [S, 3, 3] nearly orthonormal matrices (polar factor by SVD)."""
     left, _, right = np.linalg.svd(matrix)

@@ -8,12 +8,12 @@ from typing import Any
 
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutSettings
-from g3r.fitting.initial_volumes import LatticeSpacing
 from g3r.fitting.pose_rounds import PoseRoundSettings, RoundFit
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
 from g3r.fitting.voxel_correction import VoxelCorrectionSettings
+from g3r.gaussians.seeding import LatticeSpacing
 from g3r.planning.anatomy import FETAL_BRAIN, Anatomy
 from g3r.prior.maps import DEFAULT_TILING, Tiling
 from g3r.registration import RegistrationSettings

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from g3r.acquisition.slice_images import SliceImages
+from g3r.acquisition.slice_images import SliceImages, batch_arrays
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import orthonormal
 from g3r.pose_network.network import PoseNetwork, SliceBatch
@@ -55,17 +55,7 @@ def mean_pose(rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]
 
 def slice_batch(sets: Sequence[SliceImages]) -> SliceBatch:
     """The slices of several heads as one dict of tensors; stacks are numbered across all heads."""
-    n_stacks = [int(one.stack_id.max()) + 1 for one in sets]
-    first = np.cumsum([0, *n_stacks])
-    batch = {
-        name: torch.from_numpy(np.concatenate([getattr(one, name) for one in sets]).astype(np.float32))
-        for name in ("image", "area_mm2", "position_mm", "thickness_mm", "time_rank", "header_rotation")
-    }
-    batch["image"] = batch["image"][:, None]
-    stack = np.concatenate([one.stack_id + first[k] for k, one in enumerate(sets)])
-    batch["stack"] = torch.from_numpy(stack)
-    batch["set_of_stack"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor(n_stacks))
-    return batch
+    return {name: torch.from_numpy(value) for name, value in batch_arrays(sets).items()}
 
 
 def as_pose(rotation: torch.Tensor, translation_mm: torch.Tensor) -> RigidPose:

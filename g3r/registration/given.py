@@ -129,6 +129,22 @@ def measure(
     )
 
 
+def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
+    """A registration whose slices have the pixels of the slices to be fitted.
+
+    Raises:
+        InputError: the two are not about the same slices.
+    """
+    found = registration.slices
+    slices = slices.take(~np.isin(slices.stack_id, [n for n, _ in registration.left_out]))
+    if not (np.array_equal(found.stack_id, slices.stack_id) and np.array_equal(found.slice_index, slices.slice_index)):
+        raise InputError(
+            f"registration of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
+            "register the same stacks with the same masks"
+        )
+    return replace(registration, slices=slices.with_pose(found.planes.pose))
+
+
 def _orientation(
     posed: Slices, settings: RegistrationSettings, template: AtlasTemplate
 ) -> tuple[AtlasPlacement | None, Orientation | None]:

@@ -26,7 +26,7 @@ from g3r.registration.open_strain import open_strain, tilts
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
+Float64Array = NDArray[np.float64]
 
 SHEAR_ERROR = 0.01
 """Standard deviation of the strain that registration of two stacks ends with: 0.011 over eleven simulated heads with
@@ -56,7 +56,7 @@ class MotionShear:
 
     amount: float
     likely: float
-    strain: Array
+    strain: Float64Array
 
     @property
     def excess(self) -> float:
@@ -123,12 +123,12 @@ def motion_shear(slices: Slices, interleave: Sequence[int | None]) -> MotionShea
     return MotionShear(amount=estimate, likely=float(np.sqrt(variance)), strain=strain)
 
 
-def _strained(center: Array, tilt: Array, strain: Array) -> Array:
+def _strained(center: Float64Array, tilt: Float64Array, strain: Float64Array) -> Float64Array:
     """Shifts and turns [K, 6] of slices per unit of a strain."""
     return np.concatenate([center @ strain, LEVER_MM * tilt], axis=1)
 
 
-def _rigid(center: Array, own: NDArray[np.intp]) -> list[Array]:
+def _rigid(center: Float64Array, own: NDArray[np.intp]) -> list[Float64Array]:
     """Shifts and turns [K, 6] of the slices of a stack, for a shift of it along each axis and a turn about each."""
     columns = []
     for axis in np.eye(3):
@@ -141,7 +141,7 @@ def _rigid(center: Array, own: NDArray[np.intp]) -> list[Array]:
     return columns
 
 
-def _robust_fit(design: Array, answers: Array) -> tuple[Array, float]:
+def _robust_fit(design: Float64Array, answers: Float64Array) -> tuple[Float64Array, float]:
     """The first unknown of a robust fit, and its derivative by the answers [K, 6] of slices."""
     weight = np.ones(len(answers))
     for _ in range(N_ROUNDS):
@@ -153,7 +153,7 @@ def _robust_fit(design: Array, answers: Array) -> tuple[Array, float]:
     return (inverse[0] * root).reshape(answers.shape), float(found[0])
 
 
-def _of_walk(states: Array, slope: Array, time: NDArray[np.intp]) -> float:
+def _of_walk(states: Float64Array, slope: Float64Array, time: NDArray[np.intp]) -> float:
     """Variance of the sum of slope times states, if the states [K, 3] are a random walk with noise of their own added.
 
     The variance of a step is the slope of the mean squared difference of two states over their distance in time; the

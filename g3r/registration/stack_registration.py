@@ -20,7 +20,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import rotation_matrix
+from g3r.geometry.rigid import rotation_matrix, skew
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.similarity import correlation
 
@@ -155,12 +155,9 @@ def refine_stack(model: SampledSlices, slices: Slices, pose: RigidPose, n_steps:
 
 def _stack_transfer(pose: RigidPose, center: NDArray[np.float64]) -> NDArray[np.float64]:
     transposed = pose.rotation.transpose(0, 2, 1)
-    x, y, z = (pose.translation_mm - center).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
     transfer = np.zeros((len(pose), 6, 6))
     transfer[:, :3, :3] = transposed
-    transfer[:, 3:, :3] = -transposed @ cross
+    transfer[:, 3:, :3] = -transposed @ skew(pose.translation_mm - center)
     transfer[:, 3:, 3:] = transposed
     return transfer
 

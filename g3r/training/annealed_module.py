@@ -13,11 +13,14 @@ import numpy as np
 import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.callbacks import Timer
-from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
 
 from g3r.checkpoints.trained_model import TRAINING_ENTRY, NetworkConfig
-from g3r.errors import InputError, cannot_be_written
-from g3r.run.atomic_file import atomic_path, remove_leftovers
+from g3r.errors import InputError
+
+FINAL_FACTOR = 0.01
+"""Learning rate at the end over the peak rate."""
 
 
 class AnnealedModule(LightningModule):
@@ -39,6 +42,8 @@ class AnnealedModule(LightningModule):
     kind: ClassVar[str]
     """Kind of the exported model: prior, pose or mask."""
     network: Any
+    weeks: list[float]
+    """Gestational ages of the heads of the atlas template, of networks with one."""
 
     def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:
         super().__init__()
@@ -74,6 +79,43 @@ class AnnealedModule(LightningModule):
         settings = dict(getattr(data, "hparams", None) or {})
         self._training_data = data_in_words(data, settings)
         return settings
+
+    def check_data(self, *names: str) -> None:
+        """Record the data module in words; check that its settings of some names are those of the network.
+
+        Raises:
+            InputError: they differ.
+        """
+        settings = self.describe_data()
+        for name in names:
+            mine, theirs = getattr(self.network.config, name), settings.get(name)
+            if theirs is not None and theirs != mine:
+                raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
+
+    def take_template(self) -> None:
+        """Take the atlas template of the data module, and the ages of its heads, if it has one.
+
+        Raises:
+            InputError: the template is on another grid than the network's.
+        """
+        data: Any = getattr(self.trainer, "datamodule", None)
+        if not hasattr(data, "template"):
+            return
+        template = data.template()
+        self.network.set_template(torch.from_numpy(template.volume))
+        config = self.network.config  # may have taken the shape of the template
+        if not np.allclose(template.affine, config.template_grid.affine, atol=1e-3):
+            raise InputError(
+                f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
+                "pass --model.network.template_spacing_mm"
+            )
+        self.weeks = [float(week) for week in template.weeks]
+
+    def log_image(self, tag: str, image: Tensor) -> None:
+        """Log an image [rows, columns], values 0 to 1, to TensorBoard."""
+        for board in self.loggers:
+            if isinstance(board, TensorBoardLogger):
+                board.experiment.add_image(tag, image, global_step=self.global_step, dataformats="HW")
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what `g3r-export` needs, as plain values only."""
@@ -143,43 +185,6 @@ class AnnealedModule(LightningModule):
         return min((step + 1) / (self.warmup_steps + 1), 1.0) * cosine_factor(progress)
 
 
-class WholeCheckpoints(TorchCheckpointIO):
-    """Writes a checkpoint to a temporary file and renames it, so that a kill leaves the earlier one.
-
-    Lightning's own temporary file may be on another disk, from which it is copied.
-    """
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
-    ) -> None:
-        """Write a checkpoint, whole or not at all.
-
-        Args:
-            checkpoint: Lightning's state of the training.
-            path: path of the file; folders are created.
-            storage_options: not used.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        path = Path(path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(path) as temporary:
-                torch.save(checkpoint, temporary)
-        except OSError as error:
-            raise cannot_be_written(path, error) from None
-        except RuntimeError as error:  # raised by torch on a full disk
-            if "write" not in str(error):
-                raise
-            raise InputError(f"{path}: cannot be written ({error}); free some space") from None
-
-    def load_checkpoint(self, path: str | Path, *arguments: Any, **options: Any) -> dict[str, Any]:
-        """Read a checkpoint to resume from; remove temporary files of killed runs."""
-        remove_leftovers(Path(path).parent, Path(path).suffix)
-        return super().load_checkpoint(path, *arguments, **options)
-
-
 class _Throughput:
     """Samples per second, and the share of the time in which training waits for data."""
 
@@ -203,9 +208,9 @@ class _Throughput:
         return result
 
 
-def cosine_factor(progress: float, final: float = 0.01) -> float:
-    """Return half a cosine from 1 at progress 0 to `final` at progress 1 and beyond."""
-    return final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+def cosine_factor(progress: float) -> float:
+    """Return half a cosine from 1 at progress 0 to `FINAL_FACTOR` at progress 1 and beyond."""
+    return FINAL_FACTOR + (1.0 - FINAL_FACTOR) * 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
 
 
 def data_in_words(data: object, settings: Mapping[str, Any]) -> str:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from monai.losses import DiceCELoss
 from torch import Tensor
 
@@ -93,14 +92,8 @@ class MaskModule(AnnealedModule):
         """Log the means of the scores, and a row of images."""
         for name, value in summary(self._scores).items():
             self.log(f"val/{name}", value, prog_bar=name == "outline_dice")
-        for board in self.loggers:
-            if isinstance(board, TensorBoardLogger) and self._panel is not None:
-                board.experiment.add_image(
-                    "val/slices, the probability of brain, the truth",
-                    self._panel,
-                    global_step=self.global_step,
-                    dataformats="HW",
-                )
+        if self._panel is not None:
+            self.log_image("val/slices, the probability of brain, the truth", self._panel)
 
     def setup(self, stage: str) -> None:
         """Check that the pixel sizes of the data are those of the network.
@@ -108,11 +101,7 @@ class MaskModule(AnnealedModule):
         Raises:
             InputError: they differ.
         """
-        settings = self.describe_data()
-        for name in ("wide_mm", "pixel_mm"):
-            mine, theirs = getattr(self.network.config, name), settings.get(name)
-            if theirs is not None and theirs != mine:
-                raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
+        self.check_data("wide_mm", "pixel_mm")
 
     def own_description(self) -> dict[str, Any]:
         """No values besides the weights."""

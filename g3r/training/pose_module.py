@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from g3r.checkpoints.trained_model import TRAINING_ENTRY
@@ -79,7 +78,7 @@ class PoseModule(AnnealedModule):
         self.network = PoseNetwork(network)
         if start_from is not None:
             self._take_weights(Path(start_from))
-        self.weeks: list[float] = []
+        self.weeks = []
         self._scores: list[dict[str, np.ndarray]] = []
         self._panel: Tensor | None = None
 
@@ -123,14 +122,8 @@ class PoseModule(AnnealedModule):
         """Log medians over all slices and stacks, and by the number of stacks; log the row of images."""
         for name, value in summary(self._scores).items():
             self.log(f"val/{name}", value, prog_bar=name == "slice_mm")
-        for board in self.loggers:
-            if isinstance(board, TensorBoardLogger) and self._panel is not None:
-                board.experiment.add_image(
-                    "val/slices, and the template at their poses",
-                    self._panel,
-                    global_step=self.global_step,
-                    dataformats="HW",
-                )
+        if self._panel is not None:
+            self.log_image("val/slices, and the template at their poses", self._panel)
 
     def setup(self, stage: str) -> None:
         """Take the atlas template from the data module.
@@ -138,22 +131,8 @@ class PoseModule(AnnealedModule):
         Raises:
             InputError: the data module's image size or template grid differs from the network's.
         """
-        settings = self.describe_data()
-        config = self.network.config
-        for name in ("pixel_mm", "image_size"):
-            mine, theirs = getattr(config, name), settings.get(name)
-            if theirs is not None and theirs != mine:
-                raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
-        data: Any = getattr(self.trainer, "datamodule", None)
-        if hasattr(data, "template"):
-            template = data.template()
-            self.network.set_template(torch.from_numpy(template.volume))
-            if not np.allclose(template.affine, self.network.config.template_grid.affine, atol=1e-3):
-                raise InputError(
-                    f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
-                    "pass --model.network.template_spacing_mm"
-                )
-            self.weeks = [float(week) for week in template.weeks]
+        self.check_data("pixel_mm", "image_size")
+        self.take_template()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raise `InputError` for a checkpoint of another network or template."""

@@ -2,9 +2,7 @@
 
 from typing import Any, cast
 
-import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from g3r.checkpoints.trained_model import TRAINING_ENTRY
@@ -143,15 +141,8 @@ class PriorModule(AnnealedModule):
         sums, squares = (self._over_processes(one) for one in (self._scores.sums, self._scores.squares))
         for name, value in {**validation_means(sums), **psnr_by_place(squares)}.items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr_gain")
-        for logger in self.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                for n, image in sorted(self._panels.items()):
-                    logger.experiment.add_image(
-                        f"val/{stacks_suffix(n).removeprefix('_') or 'volume'}: {PANEL_TAG}",
-                        image,
-                        global_step=self.global_step,
-                        dataformats="HW",
-                    )
+        for n, image in sorted(self._panels.items()):
+            self.log_image(f"val/{stacks_suffix(n).removeprefix('_') or 'volume'}: {PANEL_TAG}", image)
 
     def _over_processes(self, sums: Tensor) -> Tensor:
         """The sum over all processes."""
@@ -165,17 +156,7 @@ class PriorModule(AnnealedModule):
         Raises:
             InputError: the template is on another grid than the network's.
         """
-        data: Any = getattr(self.trainer, "datamodule", None)
-        if hasattr(data, "template"):
-            template = data.template()
-            self.network.set_template(torch.from_numpy(template.volume))
-            config = self.network.config
-            if not np.allclose(template.affine, config.template_grid.affine, atol=1e-3):
-                raise InputError(
-                    f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
-                    "pass --model.network.template_spacing_mm"
-                )
-            self.weeks = [float(week) for week in template.weeks]
+        self.take_template()
 
     def on_fit_start(self) -> None:
         """Take the voxel size from the data module, once a checkpoint to go on with is loaded."""

@@ -90,17 +90,6 @@ def psnr_by_place(squares: Tensor) -> dict[str, float]:
     return found
 
 
-def psnr_by_bin(squares: Tensor) -> dict[str, float]:
-    """PSNR (dB, of an intensity of 1) of the prior by bin of confidence, for bins with voxels.
-
-    Args:
-        squares: as for `psnr_by_place`.
-    """
-    of_prior = squares.double().cpu()[:, :, VALIDATED.index("prior")].sum(1).tolist()
-    bins = zip(CONFIDENCE_BINS, of_prior, strict=True)
-    return {name: 10 * math.log10(count / total) for name, (total, count) in bins if count and total > 0}
-
-
 def _places(mask: Tensor, voxel_mm: float) -> list[Tensor]:
     """Masks of the rim and of the rest of a brain [I, J, K]."""
     inside = (mask > 0.5).cpu().numpy()

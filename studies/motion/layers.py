@@ -11,7 +11,7 @@ from typing import Any
 
 from studies.harness import FITS, Record, Row, Study, Task
 from studies.motion.figure import draw_slice_errors, jerk_slices
-from studies.runs import run
+from studies.runs import header_error, run
 from studies.subjects import case_folders, read_case
 from studies.tables import table
 
@@ -74,7 +74,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 def measure(folder: Path, options: argparse.Namespace) -> Row:
     """Errors after each layer, and scores of the product and of the product without each layer."""
     case = read_case(folder)
-    header = case.header_error()
+    header = header_error(case)
     layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}
     row: Row = {}
     for layer in LAYERS:

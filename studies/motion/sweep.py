@@ -10,7 +10,7 @@ from statistics import mean, median
 
 from g3r.errors import G3RError
 from studies.harness import FITS, Record, Row, Study, Task
-from studies.runs import BAD_OFF_SHARE, OFF_MM, pose_row, run
+from studies.runs import BAD_OFF_SHARE, OFF_MM, header_error, pose_row, run
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import Cell, details, table
 
@@ -67,7 +67,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 def measure(spec: SubjectSpec, options: argparse.Namespace) -> Row:
     """Register one subject and compare it with the truth."""
     case = simulated_case(spec, options.cache)
-    header = case.header_error()
+    header = header_error(case)
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         _, row = run(case, options, full=options.full)

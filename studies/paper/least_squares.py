@@ -22,7 +22,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.slice_targets import SliceModel
 
-Array = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ def least_squares_volume(
     weight: NDArray[np.float64],
     regulariser: Regulariser,
     widths: Sequence[float] | None = None,
-) -> Array:
+) -> Float32Array:
     """The volume [I, J, K] on the grid of the initial volumes, started from V_coarse.
 
     Args:
@@ -67,8 +67,8 @@ def least_squares_volume(
     strength = np.float32(regulariser.strength * float(seen[seen > 0.1 * seen.max()].mean()))
     target = operator.adjoint(pixel_weight * value)
 
-    def solved(start: Array, edges: Array | None) -> Array:
-        def normal(flat: NDArray[np.floating]) -> Array:
+    def solved(start: Float32Array, edges: Float32Array | None) -> Float32Array:
+        def normal(flat: NDArray[np.floating]) -> Float32Array:
             volume = flat.reshape(grid.shape).astype(np.float32)
             data = operator.adjoint(pixel_weight * operator.forward(volume).astype(np.float32))
             return (data + strength * divergence_of_gradient(volume, edges)).ravel().astype(np.float32)

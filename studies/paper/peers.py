@@ -23,6 +23,7 @@ from g3r.errors import G3RError, InputError
 from studies.harness import Row
 from studies.paper.scores import metric, scored
 from studies.paper.subjects import PaperSubject, paper_case
+from studies.runs import header_error
 
 PLACES = ("stacks", "masks", "thicknesses", "output")
 
@@ -100,7 +101,7 @@ def measure_peer(spec: PaperSubject, n_stacks: int, one: Peer, options: argparse
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             volume = load_volume(output)
             lpips = metric(options.lpips_weights) if options.with_lpips else None
-            common = case.header_error().common
+            common = header_error(case).common
             # a program may give the head any orientation
             scores, _ = scored(case, volume.data, volume.grid, common, lpips, near=False)
         except G3RError as error:

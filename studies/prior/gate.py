@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from math import log10
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
@@ -132,13 +133,26 @@ def scores(made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]) -> d
     """
     import torch
 
-    from g3r.training.prior_validation import VALIDATED, ValidationScores, psnr_by_bin, validation_means
+    from g3r.training.prior_validation import VALIDATED, ValidationScores, validation_means
 
     kept = ValidationScores(voxel_mm=1.0)  # any size will do, since rim and depth are pooled
     for volume, one in zip(made, volumes, strict=True):
         inside = (one["mask"] > 0.5).to(torch.float32)
         kept.add({name: volume for name in VALIDATED}, one, inside)
     return {"all": validation_means(kept.sums)["psnr_prior"], **psnr_by_bin(kept.squares)}
+
+
+def psnr_by_bin(squares: Tensor) -> dict[str, float]:
+    """PSNR (dB, of an intensity of 1) of the prior by bin of confidence, for bins with voxels.
+
+    Args:
+        squares: as for `g3r.training.prior_validation.psnr_by_place`.
+    """
+    from g3r.training.prior_validation import CONFIDENCE_BINS, VALIDATED
+
+    of_prior = squares.double().cpu()[:, :, VALIDATED.index("prior")].sum(1).tolist()
+    bins = zip(CONFIDENCE_BINS, of_prior, strict=True)
+    return {name: 10 * log10(count / total) for name, (total, count) in bins if count and total > 0}
 
 
 def tables(record: Record) -> dict[str, str]:

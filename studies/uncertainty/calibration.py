@@ -12,10 +12,11 @@ import numpy as np
 from g3r._version import __version__
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
-from g3r.uncertainty.error_model import fit_model, load_calibration, save_calibration, terms
+from g3r.uncertainty.error_model import load_calibration, terms
 from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR, calibration
 from studies.harness import FITS, Record, Row, Study, Task, positive, weights
 from studies.uncertainty.data import CHECK_SUBJECTS, FIT_SUBJECTS, NO_REGISTRATION, UNREGISTERED, Judged, judged
+from studies.uncertainty.error_fit import fit_model, save_calibration
 from studies.uncertainty.figure import draw_calibration
 from studies.uncertainty.judgement import check_record, check_text
 

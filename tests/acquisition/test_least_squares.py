@@ -97,7 +97,7 @@ def test_two_threads_find_what_one_finds() -> None:
         found = []
         for n_threads in (1, 2):
             numba.set_num_threads(n_threads)
-            found.append(solve_volume(*problem, n_iterations=6))
+            found.append(solve_volume(*problem, smoothness=0.02, n_iterations=6))
     finally:
         numba.set_num_threads(before)
     np.testing.assert_allclose(found[0], found[1], atol=1e-5)
@@ -106,7 +106,7 @@ def test_two_threads_find_what_one_finds() -> None:
 def test_nothing_measured_leaves_the_start_as_it_is() -> None:
     operator, value, weight = small_problem()
     flat = np.full(operator.grid.shape, 0.7, np.float32)
-    np.testing.assert_array_equal(solve_volume(operator, value, 0 * weight, start=flat), flat)
+    np.testing.assert_array_equal(solve_volume(operator, value, 0 * weight, smoothness=0.02, start=flat), flat)
 
 
 def test_the_convention_names_what_it_depends_on() -> None:
@@ -120,9 +120,9 @@ def test_a_volume_explains_its_slices_and_more_steps_explain_more() -> None:
     weight = np.ones(len(slices.pixel_index), np.float32)
     errors = []
     for n in (1, 4, 16):
-        volume = solve_volume(operator, slices.masked_value, weight, n_iterations=n)
+        volume = solve_volume(operator, slices.masked_value, weight, smoothness=0.02, n_iterations=n)
         errors.append(float(np.square(operator.forward(volume) - slices.masked_value).mean() ** 0.5))
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 0.05
-    again = solve_volume(operator, slices.masked_value, weight, start=volume, n_iterations=2)
+    again = solve_volume(operator, slices.masked_value, weight, smoothness=0.02, start=volume, n_iterations=2)
     assert np.abs(again - volume).max() < 0.2

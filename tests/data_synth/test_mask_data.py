@@ -13,13 +13,12 @@ pytest.importorskip("torchio")
 from data_synth.heads import PhantomSubject
 from data_synth.mask_data import MaskDataModule, MaskSamples
 from data_synth.mask_head import filled_head
-from g3r.errors import InputError
 
 SHAPES = {"wide_mm": 4.0, "wide_shape": (64, 64, 40), "pixel_mm": 2.4, "crop_shape": (48, 48, 4)}
 
 
-def samples(head: TruthVolume, **options: float) -> MaskSamples:
-    made = MaskSamples([PhantomSubject("a", 28.0, 3)], length=10, seed=7, n_scenes=2, **options, **SHAPES)  # type: ignore[arg-type]
+def samples(head: TruthVolume, in_order: bool = False) -> MaskSamples:
+    made = MaskSamples([PhantomSubject("a", 28.0, 3)], length=10, seed=7, n_scenes=2, in_order=in_order, **SHAPES)
     made._volumes = {0: filled_head(head)}
     return made
 
@@ -55,11 +54,3 @@ def test_training_batches_stack_images_and_masks_of_two_samples(centred_head: Tr
     assert batch["wide_image"].shape == batch["wide_mask"].shape == (2, 1, 48, 48, 4)
     assert batch["image"].shape == batch["mask"].shape == (2, 1, 48, 48, 4)
     assert len(data.val_dataloader()) == 1
-
-
-def test_hard_scenes_come_first_and_leave_the_others_as_they_are(centred_head: TruthVolume) -> None:
-    usual, half = samples(centred_head), samples(centred_head, hard_share=0.5)
-    assert not np.array_equal(usual[10].wide_image, half[10].wide_image)
-    np.testing.assert_array_equal(usual[11].wide_image, half[11].wide_image)
-    with pytest.raises(InputError, match="hard_share"):
-        MaskDataModule(hard_share=1.5)

@@ -25,8 +25,8 @@ import lightning.pytorch as lightning
 
 from data_synth.prior_data import StackSynthesisDataModule
 from g3r.prior.config import PriorNetworkConfig
-from g3r.training.annealed_module import WholeCheckpoints
 from g3r.training.prior_module import PriorModule
+from g3r.training.whole_checkpoints import WholeCheckpoints
 from tests.training.small_runs import Losses
 
 NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2, template_spacing_mm=3.0)

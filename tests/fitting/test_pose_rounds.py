@@ -9,12 +9,13 @@ import pytest
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting import pose_rounds
-from g3r.fitting.initial_volumes import InitialVolumes, LatticeSpacing, PriorVolume
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.pose_rounds import PoseRoundSettings, RefinedPoses, RoundFit, refine_in_rounds
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.prior_volume import prior_volume
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
+from g3r.gaussians.seeding import LatticeSpacing
 from g3r.geometry import RigidPose
 from g3r.planning.presets import PRESETS, adapted
 from g3r.prior.maps import DEFAULT_TILING

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import fit_rigid, fit_rigid_robust, orthonormal, rotation_matrix
+from g3r.geometry.rigid import fit_rigid, fit_rigid_robust, orthonormal, right_jacobian, rotation_matrix, skew
 
 
 def poses(seed: int, n: int) -> RigidPose:
@@ -161,3 +161,16 @@ def test_rows_are_replaced_and_records_joined() -> None:
     joined = RigidPose.concatenated([poses, changed])
     assert len(joined) == 8
     np.testing.assert_array_equal(joined.take(slice(4, None)).translation_mm, changed.translation_mm)
+
+
+def test_skew_is_the_cross_product() -> None:
+    a, b = np.random.default_rng(11).normal(size=(2, 6, 3))
+    np.testing.assert_allclose((skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.99e-4, 1.01e-4, 1.0, 3.0])
+def test_right_jacobian_is_the_derivative_of_the_rotation(angle: float) -> None:
+    w, dw = angle * np.array([[0.6, 0, 0.8]]), np.array([[1e-6, -2e-6, 1e-6]])
+    moved = RigidPose.from_rotvec(w, np.zeros((1, 3))).inverse() @ RigidPose.from_rotvec(w + dw, np.zeros((1, 3)))
+    expected = (right_jacobian(w) @ dw[..., None])[..., 0]
+    np.testing.assert_allclose(moved.rotvec_rad(), expected, atol=1e-11)  # second order: 1e-12

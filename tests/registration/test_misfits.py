@@ -12,8 +12,8 @@ import pytest
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
-from g3r.fitting.initial_volumes import with_pixels_of
 from g3r.registration import Registration, register, register_robustly
+from g3r.registration.given import with_pixels_of
 from g3r.registration.misfits import misfits
 from g3r.registration.stack_quality import StackQuality, unlike_others
 from g3r.registration.thresholds import MIN_CROSSING_DEG

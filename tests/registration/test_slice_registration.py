@@ -19,7 +19,7 @@ def true_volume(slices: Slices, voxel_mm: float = 1.5) -> tuple[np.ndarray, Volu
     grid = grid_around(slices, voxel_mm)
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     weight = np.ones(len(slices.pixel_index), np.float32)
-    return solve_volume(operator, slices.masked_value, weight, n_iterations=15), grid
+    return solve_volume(operator, slices.masked_value, weight, smoothness=0.02, n_iterations=15), grid
 
 
 def test_slices_find_back_to_a_volume(still: list[SimulatedStack]) -> None:

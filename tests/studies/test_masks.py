@@ -17,6 +17,7 @@ from g3r.mask_network import inference
 from studies.harness import Row
 from studies.masks import overlap, real, simulated
 from studies.masks.surrounded import SLICES_BEYOND, surrounded
+from studies.runs import header_error
 
 TRUE = np.ones((1, 3, 3), dtype=bool), (1.0, 1.0, 1.0)
 
@@ -90,7 +91,7 @@ def test_stacks_in_surroundings_keep_their_brain_in_its_place(subject: Path) -> 
     assert all(stack.image[~stack.mask].any() for stack in stacks)
     slices = by_headers(slices_from_stacks(stacks), stacks)
     moved = replace(slices, slice_index=slices.slice_index - SLICES_BEYOND)
-    still, before = case.pose_error(moved), case.header_error()
+    still, before = case.pose_error(moved), header_error(case)
     assert still.median_mm == pytest.approx(before.median_mm, abs=0.05)
     assert max(still.per_slice_mm.values()) == pytest.approx(max(before.per_slice_mm.values()), abs=0.1)
 

@@ -31,6 +31,7 @@ from studies.paper.scores import scored
 from studies.paper.subjects import FIRST_SEED, TUNING_SEED, phantom_heads, spread_order
 from studies.paper.tuning import true_volumes
 from studies.paper.unconstrained import Unconstrained, fit_unconstrained
+from studies.runs import header_error
 
 FAKE = """
 import shutil, sys
@@ -163,7 +164,7 @@ def test_beside_the_brain_black_stays_black(case: SimulatedCase) -> None:
 
 
 def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVolumes, tmp_path: Path) -> None:
-    row, comparison = scored(case, volumes.sharp, volumes.grid, case.header_error().common, None)
+    row, comparison = scored(case, volumes.sharp, volumes.grid, header_error(case).common, None)
     subject, base = "moderate-30.0w-1", {"weeks": 30.0, "motion": "moderate", "subject": "moderate-30.0w-1"}
     scores = {name: row | {"seconds": 1.0} for name in (PRODUCT, VARIATION)}
     filled = {FILL: row | {"seconds": 2.0}}

@@ -19,7 +19,7 @@ from g3r.evaluation.case import SimulatedCase, load_case, read_true_poses
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose, VolumeGrid
 from studies import subjects
-from studies.runs import aligned, off_share, orientation_deg
+from studies.runs import aligned, header_error, off_share, orientation_deg
 from studies.subjects import SubjectSpec, case_folders, data_folder, simulated_subject
 
 SPEC = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
@@ -70,7 +70,7 @@ def test_subject_is_simulated_once_and_read_back(atlas: Path, tmp_path: Path) ->
     spacing = case.truth.grid.spacing_mm  # each axis is stretched by its own factor of up to 5 %
     assert np.abs(spacing / 2 - 1).max() < 0.05
     assert len(set(np.round(spacing, 6))) == 3
-    assert 1 < case.header_error().mean_mm < 40
+    assert 1 < header_error(case).mean_mm < 40
 
     # both tables of true poses agree
     table = case.true
@@ -110,7 +110,7 @@ def test_error_of_a_hand_made_case(tmp_path: Path) -> None:
     (tmp_path / "poses.json").write_text(json.dumps(rows), encoding="utf-8")
     case = load_case(tmp_path, thickness_mm=2.5)
     assert case.stacks[1].thickness_mm == 2.5
-    error = case.header_error()
+    error = header_error(case)
     assert error.median_mm < 0.1  # the rotated slice still affects the common motion slightly
     assert error.per_slice_mm[0, 4] == pytest.approx(3.0, abs=0.1)
     points = case.points_mm[1, 7][:, :2]
