@@ -142,7 +142,8 @@ def test_the_picture_is_a_picture(reconstructed: Path) -> None:
 def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: Path, tmp_path: Path) -> None:
     (tmp_path / "volume.nii.gz").write_text("mine")
     (tmp_path / "notes.txt").write_text("mine too")
-    (tmp_path / "prior_share.nii.gz").write_text("of a result with a prior")
+    for name in ("prior_share.nii.gz", "run.json"):
+        (tmp_path / name).write_text("of a result with a prior")
     refused = run("infer", *inputs(subject), *QUICK, "--output", tmp_path)
     assert refused.returncode == 3
     assert "--force" in refused.stderr
