@@ -291,5 +291,9 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[Ina
     if not settings.use_prior:
         found.append(InactiveTerm("distance to the prior", "no prior was asked for"))
     elif not settings.distillation:
-        found.append(InactiveTerm("distance to the prior", "distillation is switched off in the settings"))
+        two = len(np.unique(slices.stack_id)) == 2
+        reason = (
+            "two stacks are nearer to the truth without it" if two else "distillation is switched off in the settings"
+        )
+        found.append(InactiveTerm("distance to the prior", reason))
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from g3r.errors import G3RError
@@ -47,7 +48,9 @@ def measure_variants(spec: PaperSubject, n_stacks: int, options: argparse.Namesp
         options: of the command.
     """
     row: Row = {"subject": spec.name, "motion": spec.motion, "n_stacks": n_stacks, "kind": "variants"}
-    case, settings = paper_case(spec, options.atlas, options.cache, n_stacks), PRESETS[options.preset]
+    case = paper_case(spec, options.atlas, options.cache, n_stacks)
+    # variants of the annealing make sense only where two stacks are held to the prior, too
+    settings = replace(PRESETS[options.preset], two_stacks_distilled=True)
     scores, seconds = {}, {}
     try:
         motion = GaussianReconstructor(options.ckpt, settings).register_stacks(case.stacks)
