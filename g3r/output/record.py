@@ -291,9 +291,10 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[Ina
     if not settings.use_prior:
         found.append(InactiveTerm("distance to the prior", "no prior was asked for"))
     elif not settings.distillation:
-        two = len(np.unique(slices.stack_id)) == 2
         reason = (
-            "two stacks are nearer to the truth without it" if two else "distillation is switched off in the settings"
+            "distillation is switched off in the settings"
+            if single
+            else "several stacks are nearer to the truth without it"
         )
         found.append(InactiveTerm("distance to the prior", reason))
     return found

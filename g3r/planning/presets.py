@@ -48,8 +48,9 @@ class ReconstructionSettings:
         least_squares_voxel_mm: without a network and a fit, the least-squares volume is written, with voxels of at
             least this size, since its noise grows as they shrink; 0 takes V_sharp.
         use_prior: False seeds from V_sharp and leaves distillation out.
-        distillation: False uses the prior only as the start of the fit.
-        two_stacks_distilled: whether the fit of two stacks is held to the prior, too; by default it only starts there.
+        distillation: whether the fit of a single stack is held to the prior; False uses it only as the start of the fit.
+        several_stacks_distilled: whether the fit of several stacks is held to the prior, too; by default it only starts
+            there.
         common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         anatomy: what the stacks show; see `for_anatomy`.
@@ -76,7 +77,7 @@ class ReconstructionSettings:
     least_squares_voxel_mm: float = 0.0
     use_prior: bool = True
     distillation: bool = True
-    two_stacks_distilled: bool = False
+    several_stacks_distilled: bool = False
     common_bias_field: bool = True
     fill_unseen: bool = True
     anatomy: Anatomy = FETAL_BRAIN
@@ -227,9 +228,9 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
             pose_rounds=settings.pose_rounds if held else settings.pose_rounds.at_most(0),
             slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held),
         )
-    # several stacks check each other: the schedule alone decides how hard the prior pulls; two are nearer to the truth,
-    # in poses and volume, if it does not pull at all (docs/paper.md, "Parts of the fit")
-    distillation = settings.distillation and (n_stacks > 2 or settings.two_stacks_distilled)
+    # several stacks check each other: they are nearer to the truth if the prior does not pull (docs/paper.md, "Parts of
+    # the fit"), and where it shall, the schedule alone decides how hard
+    distillation = settings.distillation and settings.several_stacks_distilled
     return replace(settings, distillation=distillation, slice_stage=replace(stage, prior_error=0.0))
 
 

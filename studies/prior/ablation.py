@@ -44,7 +44,7 @@ BASELINE = "fit without prior"
 FITS_COMPARED: dict[str, Mapping[str, Any]] = {
     BASELINE: {"use_prior": False},
     "prior as initialisation": {"distillation": False},
-    "with distillation": {"two_stacks_distilled": True},
+    "with distillation": {"several_stacks_distilled": True},
 }
 """Variants of the fit, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
 

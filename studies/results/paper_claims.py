@@ -127,7 +127,7 @@ def parts() -> Iterator[Claim]:
                 asked="1.16 dB or more, as in the paper" if n == 1 else f"{paper:g} dB or more",
                 block=block,
                 # without distillation the slices of a single stack do not move either
-                find=variant(n, HELD_STILL if n == 1 else SHIPPED, NONE, FEW, paper),
+                find=variant(n, HELD_STILL if n == 1 else LINEAR, NONE, FEW, paper),
                 yes=f"Distillation helps from {stacks(n)} on {kind} ({{figure}}), as the paper says.",
                 no=f"Distillation does not bring from {stacks(n)} on {kind} what the paper says ({{figure}}).",
             )
@@ -136,7 +136,7 @@ def parts() -> Iterator[Claim]:
                 text=f"Annealing it linearly is better than a constant weight, {stacks(n)}, {kind}",
                 asked=f"{NOTICEABLE_DB:g} dB or more; the paper anneals linearly",
                 block=block,
-                find=variant(n, LINEAR if n == 1 else SHIPPED, CONSTANT, FEW),
+                find=variant(n, LINEAR, CONSTANT, FEW),
                 yes=f"Annealing matters from {stacks(n)} on {kind} ({{figure}}).",
                 no=f"The schedule of annealing hardly matters from {stacks(n)} on {kind} ({{figure}}).",
             )

@@ -163,11 +163,11 @@ def test_rounds_follow_the_number_of_stacks_and_a_single_one_has_them_only_where
     assert adapted(settings, 1).pose_rounds.n_rounds(1) == 1
 
 
-def test_the_fit_of_two_stacks_alone_is_not_held_to_the_prior() -> None:
+def test_the_fit_of_a_single_stack_alone_is_held_to_the_prior() -> None:
     settings = PRESETS["balanced"]
-    assert [adapted(settings, n).distillation for n in (1, 2, 3)] == [True, False, True]
-    assert adapted(replace(settings, two_stacks_distilled=True), 2).distillation
-    assert not adapted(replace(settings, two_stacks_distilled=True, distillation=False), 2).distillation
+    assert [adapted(settings, n).distillation for n in (1, 2, 3)] == [True, False, False]
+    assert adapted(replace(settings, several_stacks_distilled=True), 2).distillation
+    assert not adapted(replace(settings, several_stacks_distilled=True, distillation=False), 2).distillation
 
 
 def test_held_out_correlation_tells_poses_half_a_millimetre_apart() -> None:

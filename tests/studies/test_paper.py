@@ -20,8 +20,10 @@ from g3r.evaluation.compare import compare
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.gaussians import render
 from g3r.geometry import RigidPose
+from g3r.planning.presets import PRESETS, adapted, changed
 from studies.harness import left_text
 from studies.paper import peers
+from studies.paper.ablation import LINEAR, NONE, SHIPPED, VARIANTS
 from studies.paper.compare import STUDY, tables
 from studies.paper.figures import draw
 from studies.paper.least_squares import TIKHONOV, TOTAL_VARIATION, least_squares_volume
@@ -202,6 +204,12 @@ def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVo
     assert (tmp_path / "paper-methods.png").stat().st_size > 5000
     assert (tmp_path / "paper-stacks.png").is_file()
     assert not (tmp_path / "paper-one-stack.png").exists()
+
+
+def test_several_stacks_are_not_distilled_where_the_variant_is_not_run_again() -> None:
+    shipped, without, held = (changed(PRESETS["balanced"], VARIANTS[name]) for name in (SHIPPED, NONE, LINEAR))
+    assert adapted(shipped, 2) == adapted(without, 2) != adapted(held, 2)
+    assert adapted(shipped, 1) != adapted(without, 1)
 
 
 def test_the_time_that_is_left() -> None:
