@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from g3r.acquisition.intensity_levels import level_notes, same_level
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.lattice_mean import fit_lattices
@@ -35,6 +36,7 @@ from g3r.registration.quality import unknown_orientation_note
 from g3r.report.reported_result import ReportedResult
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
+from g3r.run.progress import Progress, no_progress
 
 
 class GaussianReconstructor:
@@ -128,7 +130,7 @@ class GaussianReconstructor:
         self,
         slices: Slices,
         settings: RegistrationSettings | None = None,
-        progress: Callable[[int, int], None] = lambda done, total: None,
+        progress: Progress = no_progress,
         deadline: Deadline | None = None,
     ) -> Registration:
         """Poses of all slices, with this reconstructor's template and pose network.
@@ -230,15 +232,9 @@ class GaussianReconstructor:
             return None
 
         def fit() -> PriorCloud:
-            return fit_to_prior(
-                prior,
-                spacing_mm=settings.lattice.mm(volumes.slices),
-                stage=settings.prior_stage,
-                rng=stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
-                progress=run.report(Stage.FIT_TO_PRIOR),
-                deadline=deadline,
-                observer=self.observer,
-            )
+            spacing_mm = settings.lattice.mm(volumes.slices)
+            context = self._context(Stage.FIT_TO_PRIOR, settings.seed, deadline, run)
+            return fit_to_prior(prior, spacing_mm=spacing_mm, stage=settings.prior_stage, context=context)
 
         return run.droppable_stage(Stage.FIT_TO_PRIOR, fit)
 
@@ -291,10 +287,12 @@ class GaussianReconstructor:
                 distillation=settings.use_prior and settings.distillation,
                 prior_stage=settings.prior_stage,
                 slice_stage=settings.slice_stage,
-                rng=stage_rng(settings.seed, Stage.FIT_TO_SLICES),
-                progress=run.report(Stage.FIT_TO_SLICES),
-                deadline=run.deadline(plan.for_fit_to_slices()),
-                observer=self.observer,
+                context=self._context(Stage.FIT_TO_SLICES, settings.seed, run.deadline(plan.for_fit_to_slices()), run),
             )
 
         return run.stoppable_stage(Stage.FIT_TO_SLICES, fit, lambda result: (len(result.history), n_steps))
+
+    def _context(self, stage: Stage, seed: int, deadline: Deadline | None, run: RunContext) -> FitContext:
+        """Random numbers, progress, deadline and observer of a stage of the fit."""
+        rng, progress = stage_rng(seed, stage), run.report(stage)
+        return FitContext(rng=rng, progress=progress, deadline=deadline, observer=self.observer)

@@ -154,6 +154,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
 
     import numpy as np
 
+    from g3r.fitting.fit_context import FitContext
     from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 
     moments: list[float] = []
@@ -173,8 +174,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
         weight=ones,
         prior=None,
         settings=settings,
-        rng=np.random.default_rng(0),
-        observer=Watch(),
+        context=FitContext(rng=np.random.default_rng(0), observer=Watch()),
     )
     return float(np.diff(moments).min())
 

@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.held_out_prediction import MIN_HELD_OUT, HeldOutFit, lowest
 from g3r.fitting.initial_volumes import PriorVolume
-from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
+from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.prior_targets import distillation_target
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceModel, SliceTarget, slice_target
 from g3r.gaussians import GaussianCloud
 from g3r.run.on_demand import torch
+from g3r.run.progress import Progress, no_progress
 
 EVERY = 5
 """One slice in this many is held out, beginning with another slice in each stack."""
@@ -88,7 +90,7 @@ def ask_held_out_slices(
     stage: SliceStageSettings,
     settings: HeldOutSettings,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] = NO_PROGRESS,
+    progress: Progress = no_progress,
 ) -> HeldOutChoice:
     """Widths of the slice profiles with which held-out slices are predicted best.
 
@@ -136,7 +138,7 @@ def ask_held_out_slices(
 
 
 def _try_widths(
-    fitted: Callable[[float], HeldOutFit | None], progress: Callable[[int, int], None]
+    fitted: Callable[[float], HeldOutFit | None], progress: Progress
 ) -> dict[float, tuple[HeldOutFit, float]]:
     """Fits and their errors by width: two, and one beyond the better; none if too few slices are held out."""
     tried: dict[float, tuple[HeldOutFit, float]] = {}
@@ -226,7 +228,7 @@ def _short_fit(
         weight=weight,
         prior=target,
         settings=stage,
-        rng=rng,
+        context=FitContext(rng=rng),
         pixel_weight=sliced.pixel_weight * ~held[plane],
     )
     held_pixels = np.flatnonzero(slices.mask & np.isin(plane, rows))

@@ -7,20 +7,19 @@ Gaussians together, with amplitudes divided by the number of fits.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.initial_volumes import PriorVolume
-from g3r.fitting.observer import FitObserver
-from g3r.fitting.prior_stage import NO_PROGRESS, PriorCloud, PriorStageSettings
+from g3r.fitting.prior_stage import PriorCloud, PriorStageSettings
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceTarget
 from g3r.gaussians import GaussianCloud
-from g3r.run.deadline import Deadline, timed_steps
+from g3r.run.deadline import timed_steps
 from g3r.run.on_demand import torch
 
 SPACINGS = (1.0, 0.9, 1.1)
@@ -41,10 +40,7 @@ def fit_lattices(
     distillation: bool,
     prior_stage: PriorStageSettings,
     slice_stage: SliceStageSettings,
-    rng: np.random.Generator,
-    progress: Callable[[int, int], None] = NO_PROGRESS,
-    deadline: Deadline | None = None,
-    observer: FitObserver | None = None,
+    context: FitContext,
 ) -> SliceFit:
     """The first fit to the slices, together with the clouds of fits on further lattices.
 
@@ -57,11 +53,8 @@ def fit_lattices(
         distillation: whether the prior holds the fits (Eq. 9).
         prior_stage: how the Gaussians of further lattices are fitted to the prior.
         slice_stage: how a fit to the slices runs.
-        rng: draws what the fits draw.
-        progress: called with (steps done, steps in all).
-        deadline: no further fit begins that would probably end after it. A fit in which the run is stopped is dropped,
-            except the first.
-        observer: of the first fit.
+        context: random numbers, progress over all fits, deadline, and observer of the first. No further fit begins that
+            would probably end after the deadline. A fit in which the run is stopped is dropped, except the first.
 
     Raises:
         NumericalError: see `fit_slices`.
@@ -70,15 +63,13 @@ def fit_lattices(
     n_steps = n_lattices * slice_stage.n_steps
 
     def fit(number: int) -> SliceFit:
-        start = first
+        start, alone = first, context.alone(lambda done, total: context.progress(number * total + done, n_steps))
         if number:
             start = fit_to_prior(
                 prior,
                 spacing_mm=first.spacing_mm * SPACINGS[number % len(SPACINGS)],
                 stage=prior_stage,
-                rng=rng,
-                progress=NO_PROGRESS,
-                deadline=deadline,
+                context=context.alone(),
                 shift=np.modf(number * np.array(SHIFT))[0],
             )
         return fit_slices(
@@ -88,17 +79,14 @@ def fit_lattices(
             weight=weight,
             prior=held,
             settings=slice_stage,
-            rng=rng,
+            context=alone if number else replace(alone, observer=context.observer),
             pixel_weight=target.pixel_weight,
-            progress=lambda done, total: progress(number * total + done, n_steps),
-            deadline=deadline,
-            observer=None if number else observer,
         )
 
     fits: list[SliceFit] = []
-    for number, _ in timed_steps(n_lattices, deadline):
+    for number, _ in timed_steps(n_lattices, context.deadline):
         made = fit(number)
-        if fits and deadline is not None and deadline.is_stopped():
+        if fits and context.deadline is not None and context.deadline.is_stopped():
             break
         fits.append(made)
     fits = fits or [fit(0)]  # stopped before the first: a fit without steps, which records that

@@ -1,6 +1,6 @@
 """Poses and volume in rounds: slices registered to the fitted volume, and the volume made anew from them.
 
-Registration uses a least-squares volume that repeats the errors of its poses. The Gaussians are held to V_prior, whose
+Registration uses a least-squares volume that repeats the errors of its poses. The Gaussians start at V_prior, whose
 network has learned what heads look like, and slices move with them: two stacks, which check each other only where they
 cross, come nearer to the truth with every round. A round is kept if stacks predict each other no worse (`MAX_LOSS`).
 """
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
 from g3r.acquisition.robust import robust_width, slice_weights
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.initial_volumes import PriorVolume
-from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings
+from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceModel, slice_target
@@ -29,6 +30,7 @@ from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.slice_registration import register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
+from g3r.run.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -123,8 +125,8 @@ class RoundFit:
             rng: draws what the fits draw.
         """
         spacing_mm = self.lattice.mm(prior.volumes.slices)
-        stage = replace(self.prior_stage, n_steps=self.settings.prior_steps)
-        cloud = fit_to_prior(prior, spacing_mm=spacing_mm, stage=stage, rng=rng, progress=NO_PROGRESS, deadline=None)
+        stage, context = replace(self.prior_stage, n_steps=self.settings.prior_steps), FitContext(rng=rng)
+        cloud = fit_to_prior(prior, spacing_mm=spacing_mm, stage=stage, context=context)
         target = slice_target(prior, weight, self.slice_model)
         return fit_slices(
             cloud.cloud,
@@ -133,7 +135,7 @@ class RoundFit:
             weight=weight,
             prior=distillation_target(prior) if self.distillation else None,
             settings=replace(self.slice_stage, n_steps=self.settings.slice_steps),
-            rng=rng,
+            context=context,
             pixel_weight=target.pixel_weight,
         )
 
@@ -146,7 +148,7 @@ def refine_in_rounds(
     prior_of: Callable[[Registration, bool], PriorVolume],
     fit: RoundFit,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] = NO_PROGRESS,
+    progress: Progress = no_progress,
 ) -> RefinedPoses:
     """Poses and prior volume after up to `n_rounds` rounds; the first round that does not help is the last.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +9,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes, volume_planes
 from g3r.fitting.divergence_guard import DivergenceGuard
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.objective import CloudObjective, ImageTerm
-from g3r.fitting.observer import FitMoment, FitObserver, is_due
+from g3r.fitting.observer import FitMoment, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.schedules import cosine_decay
@@ -20,15 +20,13 @@ from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
-from g3r.run.deadline import Deadline, timed_steps
+from g3r.run.deadline import timed_steps
 
 PLANE_SHARE = 0.34
 """Share of the volume's planes in a step: a third of the work, and every plane is drawn several times in a fit."""
 
 STEPS_PER_DRAW = 10
 """Steps between two draws of a volume's planes; each draw needs new overlap lists."""
-
-NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,14 +101,7 @@ class VolumeTarget:
 
 
 def fit_prior(
-    cloud: GaussianCloud,
-    target: VolumeTarget,
-    settings: PriorStageSettings,
-    rng: np.random.Generator,
-    *,
-    progress: Callable[[int, int], None] = NO_PROGRESS,
-    deadline: Deadline | None = None,
-    observer: FitObserver | None = None,
+    cloud: GaussianCloud, target: VolumeTarget, settings: PriorStageSettings, context: FitContext
 ) -> tuple[GaussianCloud, list[float]]:
     """Fit a seeded cloud to the prior volume (G3R Eq. 8).
 
@@ -121,10 +112,7 @@ def fit_prior(
         cloud: seeded Gaussians.
         target: the prior volume.
         settings: numbers of steps, and weights.
-        rng: draws the planes of each step.
-        progress: called with (steps done, steps in all).
-        deadline: fewer steps if they would end after it.
-        observer: called at steps of the fit.
+        context: random numbers, progress, deadline and observer.
 
     Returns:
         The fitted cloud, and the image loss of each step.
@@ -145,17 +133,17 @@ def fit_prior(
     guard = DivergenceGuard(parameters, float(np.average(np.abs(target.value), weights=target.weight)))
     history = []
     n_planes = max(1, round(PLANE_SHARE * len(target.planes)))
-    for step, fraction in timed_steps(settings.n_steps, deadline):
-        progress(step, settings.n_steps)
+    for step, fraction in timed_steps(settings.n_steps, context.deadline):
+        context.progress(step, settings.n_steps)
         if step % STEPS_PER_DRAW == 0:
-            term = whole.take(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))
+            term = whole.take(np.sort(context.rng.choice(len(target.planes), n_planes, replace=False)))
             terms = {"prior": (term, PlaneState.of(term.planes, cloud.origin_mm))}
         loss = objective.begin(terms)
         image = loss.add("prior", 1.0).mean
         guard.step(image + loss.finish(), cosine_decay(fraction))
         history.append(image)
-        if is_due(observer, step + 1, settings.n_steps):
+        if is_due(observer := context.observer, step + 1, settings.n_steps):
             observer(FitMoment(step=step + 1, loss={"image": image}, parameters=parameters))
-    progress(settings.n_steps, settings.n_steps)
+    context.progress(settings.n_steps, settings.n_steps)
     guard.finish()
     return parameters.cloud(), history

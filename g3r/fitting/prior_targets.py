@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.coarse_volume import confidence
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.initial_volumes import PriorVolume
-from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import PriorCloud, PriorStageSettings, VolumeTarget, fit_prior
 from g3r.gaussians.seeding import seed_cloud
-from g3r.run.deadline import Deadline
 
 MIN_DISTILLATION = 1e-3
 """Smallest weight of the prior, where slices are dense; above zero so that every voxel of the head has a weight."""
@@ -23,10 +22,7 @@ def fit_to_prior(
     *,
     spacing_mm: float,
     stage: PriorStageSettings,
-    rng: np.random.Generator,
-    progress: Callable[[int, int], None],
-    deadline: Deadline | None,
-    observer: FitObserver | None = None,
+    context: FitContext,
     shift: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
 ) -> PriorCloud:
     """Gaussians seeded in the prior volume and fitted to it (G3R Eq. 8).
@@ -35,16 +31,13 @@ def fit_to_prior(
         prior: V_prior on its grid.
         spacing_mm: of the lattice of Gaussians.
         stage: how the fit runs.
-        rng: draws the planes of each step.
-        progress: called with (steps done, steps in all).
-        deadline: when the fit has to end.
-        observer: called at steps of the fit.
+        context: random numbers, progress, deadline and observer.
         shift: [3] of the lattice; see `seed_cloud`.
     """
     grid = prior.volumes.grid
     seeds = seed_cloud(prior.values, prior.support, grid, spacing_mm, shift)
     target = VolumeTarget.of(prior.values, prior.support.astype(np.float32), grid)
-    cloud, history = fit_prior(seeds, target, stage, rng, progress=progress, deadline=deadline, observer=observer)
+    cloud, history = fit_prior(seeds, target, stage, context)
     return PriorCloud(cloud, history, spacing_mm)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,18 +11,19 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import slice_weights
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.objective import CloudObjective, ImageTerm
-from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
+from g3r.fitting.observer import FitMoment, SliceMoment, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
-from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
+from g3r.fitting.prior_stage import STEPS_PER_DRAW, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay, prior_strength
 from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
 from g3r.fitting.slice_turns import SliceTurns
 from g3r.gaussians import GaussianCloud, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
-from g3r.run.deadline import Deadline, timed_steps
+from g3r.run.deadline import timed_steps
 
 AMPLITUDE_DAMPING = 0.05
 """Pull of the first amplitudes towards stage 1 (relative): slices do not determine Gaussians that lie between them."""
@@ -107,11 +107,8 @@ def fit_slices(
     weight: NDArray[np.float64],
     prior: VolumeTarget | None,
     settings: SliceStageSettings,
-    rng: np.random.Generator,
+    context: FitContext,
     pixel_weight: NDArray[np.float32] | None = None,
-    progress: Callable[[int, int], None] = NO_PROGRESS,
-    deadline: Deadline | None = None,
-    observer: FitObserver | None = None,
 ) -> SliceFit:
     """Refine a cloud against slices (G3R Eq. 9).
 
@@ -123,11 +120,8 @@ def fit_slices(
         prior: target of the distillation, with a weight from 0 (measured) to 1 (not measured) for each voxel; None
             without distillation.
         settings: numbers of steps, and weights.
-        rng: draws the prior's planes.
+        context: random numbers, progress, deadline and observer.
         pixel_weight: [P] not negative; the slices' masks when None.
-        progress: called with (steps done, steps in all).
-        deadline: fewer steps if they would end after it; schedules still run to their ends.
-        observer: called at steps of the fit.
 
     Raises:
         NumericalError: a loss that is not finite from the start.
@@ -162,10 +156,10 @@ def fit_slices(
     )
     guard = DivergenceGuard(parameters, loss.level)
     history: list[dict[str, float]] = []
-    for step, fraction in timed_steps(settings.n_steps, deadline):
-        progress(step, settings.n_steps)
+    for step, fraction in timed_steps(settings.n_steps, context.deadline):
+        context.progress(step, settings.n_steps)
         if step % STEPS_PER_DRAW == 0:
-            loss.draw(rng)
+            loss.draw(context.rng)
         value, entry = loss.evaluate(fraction)
         if not guard.step(value, cosine_decay(fraction)):
             entry |= {"rollback": 1.0}
@@ -174,10 +168,10 @@ def fit_slices(
         history.append(entry)
         if step and step % settings.reweight_every == 0:
             guard.rescale(loss.reweight())
-        if is_due(observer, step + 1, settings.n_steps):
+        if is_due(observer := context.observer, step + 1, settings.n_steps):
             moved = SliceMoment(loss.state(), slices)
             observer(FitMoment(step=step + 1, loss=entry, parameters=parameters, slices=moved))
-    progress(settings.n_steps, settings.n_steps)
+    context.progress(settings.n_steps, settings.n_steps)
     guard.finish()
     state = loss.state()
     return SliceFit(

@@ -48,7 +48,7 @@ class ReconstructionSettings:
         least_squares_voxel_mm: without a network and a fit, the least-squares volume is written, with voxels of at
             least this size, since its noise grows as they shrink; 0 takes V_sharp.
         use_prior: False seeds from V_sharp and leaves distillation out.
-        distillation: whether the fit of a single stack is held to the prior; False uses it only as the start of the fit.
+        distillation: whether the fit of a single stack is held to the prior; False uses the prior only as its start.
         several_stacks_distilled: whether the fit of several stacks is held to the prior, too; by default it only starts
             there.
         common_bias_field: divide out the bias field that stacks share (N4).

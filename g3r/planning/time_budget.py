@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from g3r.acquisition.planes import Slices
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
@@ -279,6 +280,6 @@ def timed_step(cloud: GaussianCloud, slices: Slices, rng: np.random.Generator) -
     for n_steps in (1, 1, 4):  # the first loads the kernels; the last difference leaves out the set-up
         settings = SliceStageSettings(n_steps=n_steps, amplitude_iterations=0)
         start = time.perf_counter()
-        fit_slices(cloud, part, gain=ones, weight=ones, prior=None, settings=settings, rng=rng)
+        fit_slices(cloud, part, gain=ones, weight=ones, prior=None, settings=settings, context=FitContext(rng=rng))
         seconds.append(time.perf_counter() - start)
     return max(1e-6, (seconds[-1] - seconds[-2]) / 3) * len(slices) / len(part)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, fi
 from g3r.registration.stack_quality import StackQuality
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
 from g3r.run.deadline import Deadline
+from g3r.run.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +90,7 @@ class Registration:
 def register(
     slices: Slices,
     settings: RegistrationSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
     *,
     template: AtlasTemplate | None = None,
     proposals: Mapping[str, RigidPose] | None = None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from g3r.registration.overlap import overlap_of
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import fitted_in_place
+from g3r.run.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ def measure(
     slices: Slices,
     given: GivenPoses,
     settings: RegistrationSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
     template: AtlasTemplate | None = None,
 ) -> Registration:
     """A registration by given poses: gains, weights and agreement, with the head in standard orientation.

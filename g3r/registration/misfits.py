@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from g3r.registration.settings import RegistrationSettings
 from g3r.registration.stack_quality import StackQuality, is_mirrored, unlike_others
 from g3r.registration.thresholds import IN_PLACE_CORRELATION
 from g3r.run.deadline import Deadline
+from g3r.run.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ logger = logging.getLogger(__name__)
 def register_robustly(
     slices: Slices,
     settings: RegistrationSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
     *,
     template: AtlasTemplate | None = None,
     proposals: Mapping[str, RigidPose] | None = None,

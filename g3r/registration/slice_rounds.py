@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +21,7 @@ from g3r.registration.similarity import best_gain
 from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
 from g3r.run.deadline import Deadline, timed_steps
+from g3r.run.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class FittedSlices:
 def refine_slices(
     slices: Slices,
     settings: RegistrationSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
     deadline: Deadline | None = None,
     seen_share: NDArray[np.float64] | None = None,
 ) -> FittedSlices:
@@ -176,9 +176,7 @@ def carried_on(before: Slices, after: Slices, factor: float) -> Slices:
     return after.with_pose(now @ RigidPose.from_rotvec(more * turned, more * went))
 
 
-def fitted_in_place(
-    slices: Slices, settings: RegistrationSettings, progress: Callable[[int, int], None] = lambda done, total: None
-) -> FittedSlices:
+def fitted_in_place(slices: Slices, settings: RegistrationSettings, progress: Progress = no_progress) -> FittedSlices:
     """Gains, weights and correlations of slices at fixed poses, as `refine_slices` finds them.
 
     Slices of a single stack, which explain themselves, keep a gain and a weight of 1, as there.

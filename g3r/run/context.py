@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from g3r.run.clock import Clock
 from g3r.run.deadline import Deadline
+from g3r.run.progress import Progress
 from g3r.run.reporter import Reporter
 from g3r.run.stage_store import StageStore
 from g3r.run.stop_request import StopRequest
@@ -116,7 +117,7 @@ class RunContext:
         if self.stop_request is not None:
             self.stop_request.postpone()
 
-    def report(self, stage: str) -> Callable[[int, int], None]:
+    def report(self, stage: str) -> Progress:
         """The progress function (steps done, steps in all) of one stage."""
 
         def report(done: int, total: int) -> None:

@@ -51,7 +51,8 @@ def measure_variants(spec: PaperSubject, n_stacks: int, options: argparse.Namesp
     row: Row = {"subject": spec.name, "motion": spec.motion, "n_stacks": n_stacks, "kind": "variants"}
     case = paper_case(spec, options.atlas, options.cache, n_stacks)
     settings = PRESETS[options.preset]
-    scores, seconds = {}, {}
+    scores: dict[str, Row] = {}
+    seconds: dict[str, float] = {}
     try:
         motion = GaussianReconstructor(options.ckpt, settings).register_stacks(case.stacks)
         for name, changes in VARIANTS.items():

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud, render
@@ -61,5 +62,5 @@ def fit(
         weight=ones,
         prior=prior,
         settings=settings or SliceStageSettings(**({"n_steps": 40} | options)),
-        rng=np.random.default_rng(0),
+        context=FitContext(rng=np.random.default_rng(0)),
     )

@@ -10,6 +10,7 @@ import pytest
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.held_out_prediction import HeldOutFit, lowest
 from g3r.fitting.held_out_slices import HeldOutChoice, HeldOutSettings, ask_held_out_slices, held_out_rows
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
@@ -35,10 +36,8 @@ def start(width: float) -> tuple[PriorVolume, GaussianCloud]:
 
 
 def cloud_of_prior(prior: PriorVolume) -> GaussianCloud:
-    rng = np.random.default_rng(0)
-    stage = PriorStageSettings(n_steps=10)
-    found = fit_to_prior(prior, spacing_mm=2.0, stage=stage, rng=rng, progress=lambda *_: None, deadline=None)
-    return found.cloud
+    stage, context = PriorStageSettings(n_steps=10), FitContext(rng=np.random.default_rng(0))
+    return fit_to_prior(prior, spacing_mm=2.0, stage=stage, context=context).cloud
 
 
 def ask(prior: PriorVolume, cloud: GaussianCloud) -> HeldOutChoice:

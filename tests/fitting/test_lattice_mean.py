@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.lattice_mean import SPACINGS, fit_lattices, mean_cloud
 from g3r.fitting.prior_stage import PriorStageSettings
@@ -35,10 +36,8 @@ def prior() -> PriorVolume:
 
 
 def fitted(prior: PriorVolume, n_lattices: int, **options: Any) -> SliceFit:
-    weight, rng = np.ones(len(prior.volumes.slices)), np.random.default_rng(0)
-    first = fit_to_prior(
-        prior, spacing_mm=SPACING_MM, stage=STAGE, rng=rng, progress=lambda done, total: None, deadline=None
-    )
+    weight, context = np.ones(len(prior.volumes.slices)), FitContext(rng=np.random.default_rng(0), **options)
+    first = fit_to_prior(prior, spacing_mm=SPACING_MM, stage=STAGE, context=FitContext(rng=context.rng))
     return fit_lattices(
         first,
         prior,
@@ -48,8 +47,7 @@ def fitted(prior: PriorVolume, n_lattices: int, **options: Any) -> SliceFit:
         distillation=False,
         prior_stage=STAGE,
         slice_stage=SliceStageSettings(n_steps=N_STEPS, prior_error=0.0),
-        rng=rng,
-        **options,
+        context=context,
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
 from g3r.fitting.schedules import AnnealedWeight, prior_strength
 from g3r.gaussians import GaussianCloud, render
@@ -29,7 +30,9 @@ def test_stage_1_comes_close_to_the_volume(volume: np.ndarray) -> None:
     calls: list[tuple[int, int]] = []
     settings = PriorStageSettings(n_steps=30)
     progress = lambda done, total: calls.append((done, total))  # noqa: E731
-    cloud, history = fit_prior(seeded(volume), target, settings, np.random.default_rng(0), progress=progress)
+    cloud, history = fit_prior(
+        seeded(volume), target, settings, FitContext(rng=np.random.default_rng(0), progress=progress)
+    )
     assert len(history) == 30
     assert np.mean(history[-5:]) < 0.75 * np.mean(history[:5])
     assert volume_error(cloud, volume) < 0.35 * volume_error(seeded(volume), volume)
@@ -40,7 +43,9 @@ def test_stage_1_comes_close_to_the_volume(volume: np.ndarray) -> None:
 
 def test_stage_1_without_steps_still_solves_for_the_peaks(volume: np.ndarray) -> None:
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
-    cloud, history = fit_prior(seeded(volume), target, PriorStageSettings(n_steps=0), np.random.default_rng(0))
+    cloud, history = fit_prior(
+        seeded(volume), target, PriorStageSettings(n_steps=0), FitContext(rng=np.random.default_rng(0))
+    )
     assert history == []
     assert volume_error(cloud, volume) < 0.6 * volume_error(seeded(volume), volume)
 

@@ -13,6 +13,7 @@ from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
 from g3r.fitting import divergence_guard as divergence_guard
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.parameters import LearningRates
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import render
@@ -180,7 +181,7 @@ def fit_at(factor: float, guarded: bool = True, n_steps: int = 60) -> SliceFit:
             weight=ones,
             prior=None,
             settings=settings,
-            rng=np.random.default_rng(0),
+            context=FitContext(rng=np.random.default_rng(0)),
         )
     finally:
         divergence_guard.RISE = before

@@ -15,6 +15,7 @@ from g3r.errors import InputError, NumericalError
 from g3r.fitting import divergence_guard as divergence_guard
 from g3r.fitting import prior_stage
 from g3r.fitting.divergence_guard import DivergenceGuard
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
 from g3r.fitting.schedules import AnnealedWeight
@@ -29,9 +30,11 @@ from tests.tally import Tally
 def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options: Any) -> SliceFit:
     ones = np.ones(len(slices))
     settings = SliceStageSettings(**({"n_steps": 25, "reweight_every": 10} | options))
-    return fit_slices(
-        cloud, slices, gain=ones, weight=ones, prior=prior, settings=settings, rng=np.random.default_rng(0)
-    )
+    return fit_slices(cloud, slices, gain=ones, weight=ones, prior=prior, settings=settings, context=context())
+
+
+def context() -> FitContext:
+    return FitContext(rng=np.random.default_rng(0))
 
 
 def seeded() -> GaussianCloud:
@@ -119,7 +122,7 @@ def test_a_prior_stage_on_scaled_volumes_is_the_same_scaled(factor: float, tally
         with tally.case():
             start = seed_cloud(volume, mask, grid, 2.8)
             start = start.with_amplitude(start.amplitude * scale)
-            found, _ = fit_prior(start, target, PriorStageSettings(n_steps=0), np.random.default_rng(0))
+            found, _ = fit_prior(start, target, PriorStageSettings(n_steps=0), context())
             fitted.append(found.amplitude / scale)
     assert torch.equal(*fitted)
 
@@ -165,9 +168,7 @@ def test_stage_1_steps_back_as_well(monkeypatch: pytest.MonkeyPatch, caplog: pyt
     volume = volume_from_pixels(render(cloud, volume_planes(grid)).numpy(), grid)
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     monkeypatch.setattr(prior_stage, "LearningRates", lambda: times(30.0))
-    found, loss = fit_prior(
-        seed_cloud(volume, mask, grid, 2.8), target, PriorStageSettings(n_steps=40), np.random.default_rng(0)
-    )
+    found, loss = fit_prior(seed_cloud(volume, mask, grid, 2.8), target, PriorStageSettings(n_steps=40), context())
     assert "back to the best state" in caplog.text
     assert np.isfinite(loss).all()
     assert loss[-1] < 2 * loss[0]

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
+from g3r.fitting.fit_context import FitContext
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud, render
@@ -32,14 +33,14 @@ def half_measured() -> Slices:
 
 def whole_fit(prior: np.ndarray, slices: Slices) -> tuple[SliceFit, np.ndarray, np.ndarray]:
     """Both stages from a prior volume, and the volumes after the first and after the second."""
-    rng = np.random.default_rng(0)
+    context = FitContext(rng=np.random.default_rng(0))
     whole = VolumeTarget.of(prior, BALL.astype(np.float32), GRID)
-    cloud, _ = fit_prior(seeded(prior), whole, PriorStageSettings(n_steps=15), rng)
+    cloud, _ = fit_prior(seeded(prior), whole, PriorStageSettings(n_steps=15), context)
     density = coarse_and_density(slices, GRID)[1]
     target = VolumeTarget.of(prior, (BALL * np.maximum(np.exp(-density), 1e-3)).astype(np.float32), GRID)
     ones = np.ones(len(slices))
     settings = SliceStageSettings(n_steps=40, optimise_poses=False, optimise_bias_field=False)
-    fit = fit_slices(cloud, slices, gain=ones, weight=ones, prior=target, settings=settings, rng=rng)
+    fit = fit_slices(cloud, slices, gain=ones, weight=ones, prior=target, settings=settings, context=context)
     return fit, as_volume(cloud), as_volume(fit.cloud)
 
 
