@@ -72,7 +72,7 @@ def run(
         more = {"psnr_db": scores.psnr_db, "ssim": scores.ssim, "stage_seconds": result.record.seconds}
     else:
         assert motion is not None
-        warnings = pose_warnings(motion, stack_qualities(motion, len(case.stacks)), case.stacks)
+        warnings = pose_warnings(stack_qualities(motion, len(case.stacks)), case.stacks)
         warnings += parallel_warnings(motion.slices)
         slices, weight = motion.slices, motion.weight
         error, more = case.pose_error(slices), {}

@@ -56,7 +56,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     settings, volumes = plan.settings, found.prior.volumes
     qualities = stack_qualities(found.registration, len(found.stacks))
     run.notes += left_out_notes(qualities, found.stacks)
-    run.warnings += pose_warnings(found.registration, qualities, found.stacks)
+    run.warnings += pose_warnings(qualities, found.stacks)
     run.warnings += parallel_warnings(found.registration.slices)
     fit = found.fit or found.no_fit()
     cloud = mean_cloud(fit)

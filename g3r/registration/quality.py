@@ -85,11 +85,10 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
     return found
 
 
-def pose_warnings(registration: Registration, qualities: Sequence[StackQuality], stacks: Sequence[Stack]) -> list[str]:
+def pose_warnings(qualities: Sequence[StackQuality], stacks: Sequence[Stack]) -> list[str]:
     """Warnings about stacks, a line each, such as for a stack that is not reliable.
 
     Args:
-        registration: of the stacks.
         qualities: of each stack.
         stacks: as given, for their names.
     """

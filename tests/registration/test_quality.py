@@ -59,7 +59,7 @@ def test_stacks_that_are_registered_are_reliable(still: list[SimulatedStack], mo
     assert all(one.reliable for one in found)
     assert [one.held_out_correlation for one in found] == moving.estimate.held_out
     stacks = [one.stack for one in moving.stacks]
-    assert pose_warnings(moving.estimate, found, stacks) == []
+    assert pose_warnings(found, stacks) == []
     assert registration_summary(found).startswith("3 of 3 stacks are registered")
 
 
@@ -83,7 +83,7 @@ def test_stacks_left_far_apart_are_not_reliable(head: Phantom, moving: Moving) -
     found = stack_qualities(estimate, 3)
     assert not any(one.reliable for one in found)
     stacks = [one.stack for one in moving.stacks]
-    lines = pose_warnings(estimate, found, stacks)
+    lines = pose_warnings(found, stacks)
     assert len(lines) == 3
     for line, stack, one in zip(lines, stacks, found, strict=True):
         assert line.startswith(f"{stack.name}: registration probably failed")
@@ -154,7 +154,7 @@ def test_a_mirror_image_of_two_others_is_not_reliable_and_called_by_its_name(
     estimate.handedness = [0.2, 0.2, hand]
     found = stack_qualities(estimate, 3)
     assert [one.reliable for one in found] == [True, True, reliable]
-    lines = pose_warnings(estimate, found, [one.stack for one in still])
+    lines = pose_warnings(found, [one.stack for one in still])
     assert len(lines) == (0 if reliable else 1)
     assert all(line.startswith(f"{still[2].stack.name}: probably a mirror image") for line in lines)
 
@@ -164,7 +164,7 @@ def test_of_two_stacks_one_may_be_a_mirror_image_and_both_are_reliable(still: li
     estimate.handedness = [0.2, MIRRORED_BELOW - 0.01]
     found = stack_qualities(estimate, 3)
     assert [one.reliable for one in found] == [True, False, True]  # the second stack has no slices
-    (line,) = pose_warnings(estimate, found, [one.stack for one in still])[1:]
+    (line,) = pose_warnings(found, [one.stack for one in still])[1:]
     assert line.startswith(f"{still[2].stack.name}: may be a mirror image of what the other stack shows")
 
 
@@ -181,7 +181,7 @@ def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[Simulated
     found = stack_qualities(estimate, 3)
     assert [one.held_out_correlation for one in found] == [0.7, None, 0.9]
     assert [one.reliable for one in found] == [True, False, True]
-    lines = pose_warnings(estimate, found, [one.stack for one in still])
+    lines = pose_warnings(found, [one.stack for one in still])
     assert len(lines) == 1
     assert lines[0].startswith(f"{still[1].stack.name}: no slice")
     assert registration_summary(found) == (
@@ -198,13 +198,13 @@ def test_a_stack_that_was_left_out_does_not_make_the_others_unreliable(still: li
         "2 of 3 stacks are registered; 1 left out; correlation with the others: 0.70, 0.31"
     )
     stacks = [one.stack for one in still]
-    assert pose_warnings(estimate, found, stacks) == []
+    assert pose_warnings(found, stacks) == []
     (line,) = left_out_notes(found, stacks)
     assert line.startswith(
         f"{still[1].stack.name}: left out of the volume, it does not fit the other stacks (agreement 0.31"
     )
     mirrored = [one if n != 1 else replace(one, handedness=MIRRORED_BELOW - 0.1) for n, one in enumerate(found)]
-    (line,) = pose_warnings(estimate, mirrored, stacks)
+    (line,) = pose_warnings(mirrored, stacks)
     assert line.startswith(f"{still[1].stack.name}: left out of the volume, it is probably a mirror image")
     assert left_out_notes(mirrored, stacks) == []
 
@@ -222,13 +222,13 @@ def test_a_single_stack_with_a_hole_is_warned_about(still: list[SimulatedStack])
     holed = slices.take(np.setdiff1d(np.arange(len(slices)), np.arange(middle - 1, middle + 2)))
     estimate = register(holed, QUICK)
     found = stack_qualities(estimate, 1)
-    (line,) = pose_warnings(estimate, found, [still[0].stack])
+    (line,) = pose_warnings(found, [still[0].stack])
     assert found[0].n_missing == 3
     assert found[0].reliable is None
     assert "3 slices are missing" in line
     assert "what the header says" in line
     whole = register(slices, QUICK)
-    assert pose_warnings(whole, stack_qualities(whole, 1), [still[0].stack]) == []
+    assert pose_warnings(stack_qualities(whole, 1), [still[0].stack]) == []
 
 
 @pytest.mark.parametrize(
@@ -242,6 +242,6 @@ def test_stacks_that_share_little_are_not_reliable(
     estimate = replace(moving.estimate, overlap=overlap)
     found = stack_qualities(estimate, 3)
     assert [one.reliable for one in found] == [True, reliable, True]
-    lines = pose_warnings(estimate, found, [one.stack for one in moving.stacks])
+    lines = pose_warnings(found, [one.stack for one in moving.stacks])
     assert len(lines) == (not reliable)
     assert all(f"others saw {share:.0%} of it" in line for line in lines)

@@ -222,8 +222,7 @@ def test_warnings_about_a_quality_are_those_that_the_verdict_says_otherwise() ->
     assert set(judged) == set(JUDGED)
     for start, one in judged.items():
         named: Any = stack("c.nii", one)
-        registration: Any = None
-        (line,) = pose_warnings(registration, [one], [named])
+        (line,) = pose_warnings([one], [named])
         assert line.startswith(f"c.nii: {start}")
         found = stacks_with(named)
         assert verdict_of(replace(found, warnings=[line])) == verdict_of(found)
