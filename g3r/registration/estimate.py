@@ -111,13 +111,7 @@ def register(
     settings = replace(settings, finest_voxel_mm=max(settings.finest_voxel_mm, least_mm))
     samples = StackSamples.of_all(slices, settings.n_candidates)
     single = len(samples) == 1
-    if template is not None and not (settings.template and template_fits(slices, template)):
-        template = None
-    if single:
-        found = search_single(slices, samples[0], settings, template)
-    else:
-        search_deadline = deadline.part(SEARCH_SHARE) if deadline else None
-        found = GlobalSearch(slices, samples, settings, template).run(proposals or {}, search_deadline)
+    found = _search(slices, samples, settings, template, proposals or {}, deadline)
     n_segments, interleave = segments_of(samples, found.motion)
     rounds = replace(settings, n_rounds=0) if single else settings
     rounds_deadline = deadline.part(ROUNDS_SHARE) if deadline else None
@@ -129,16 +123,7 @@ def register(
         rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
         fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings)
     overlap = overlap_of(slices, samples, fitted.slices.world_from_header()) if missing else None
-    orientation, hands = None, None
-    asks = settings.check_handedness and not single
-    if found.placed is not None and (settings.standard_orientation or asks):
-        start = found.placed.motion(len(slices), samples)
-        rng = np.random.default_rng(settings.seed)
-        orientation = standard_orientation(fitted.slices, found.placed.templates, start, rng)
-        if orientation is not None and asks:
-            hands = handedness(fitted.slices.with_pose(orientation.pose), fitted.gain, settings.seed)
-    if not settings.standard_orientation:
-        orientation = None
+    orientation, hands = _orientation(fitted, samples, found, settings)
     pose = centred_on_headers(fitted.slices).planes.pose if orientation is None else orientation.pose
     return Registration(
         slices=without_excess_shear(given.with_pose(pose), interleave),
@@ -157,6 +142,39 @@ def register(
         handedness=hands,
         misfit_without=misfit_without_each(fitted, settings.finest_voxel_mm, settings.max_pixels),
     )
+
+
+def _search(
+    slices: Slices,
+    samples: list[StackSamples],
+    settings: RegistrationSettings,
+    template: AtlasTemplate | None,
+    proposals: Mapping[str, RigidPose],
+    deadline: Deadline | None,
+) -> SearchResult:
+    """The global search, with the atlas template where the settings ask for it and it fits heads of this size."""
+    if template is not None and not (settings.template and template_fits(slices, template)):
+        template = None
+    if len(samples) == 1:
+        return search_single(slices, samples[0], settings, template)
+    part = deadline.part(SEARCH_SHARE) if deadline else None
+    return GlobalSearch(slices, samples, settings, template).run(proposals, part)
+
+
+def _orientation(
+    fitted: FittedSlices, samples: list[StackSamples], found: SearchResult, settings: RegistrationSettings
+) -> tuple[Orientation | None, list[float | None] | None]:
+    """Standard orientation, and the handedness of each stack; None where settings or search leave them out."""
+    asks = settings.check_handedness and len(samples) > 1
+    if found.placed is None or not (settings.standard_orientation or asks):
+        return None, None
+    start = found.placed.motion(len(fitted.slices), samples)
+    rng = np.random.default_rng(settings.seed)
+    orientation = standard_orientation(fitted.slices, found.placed.templates, start, rng)
+    hands = None
+    if orientation is not None and asks:
+        hands = handedness(fitted.slices.with_pose(orientation.pose), fitted.gain, settings.seed)
+    return orientation if settings.standard_orientation else None, hands
 
 
 def measured_again(registration: Registration, fill: PlacedHead | None = None) -> Registration:
