@@ -46,7 +46,8 @@ FITS_COMPARED: dict[str, Mapping[str, Any]] = {
     "prior as initialisation": {"distillation": False},
     "with distillation": {"several_stacks_distilled": True},
 }
-"""Variants of the fit, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
+"""Variants of the fit, as changes of the settings (see `g3r.planning.presets.changed`); the last is the
+product from one stack, the second from several."""
 
 VARIANTS = ("V_coarse", "V_sharp", "prior alone", *FITS_COMPARED)
 """All variants in the order of the table."""
