@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,7 +26,3 @@ class FitContext:
     progress: Progress = no_progress
     deadline: Deadline | None = None
     observer: FitObserver | None = None
-
-    def alone(self, progress: Progress = no_progress) -> FitContext:
-        """The context of a part of the fit: the same random numbers and deadline, progress of its own, no observer."""
-        return replace(self, progress=progress, observer=None)

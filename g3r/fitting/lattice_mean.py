@@ -21,6 +21,7 @@ from g3r.fitting.slice_targets import SliceTarget
 from g3r.gaussians import GaussianCloud
 from g3r.run.deadline import timed_steps
 from g3r.run.on_demand import torch
+from g3r.run.progress import no_progress
 
 SPACINGS = (1.0, 0.9, 1.1)
 """Spacings of the lattices in turn, over the spacing of the first."""
@@ -63,13 +64,13 @@ def fit_lattices(
     n_steps = n_lattices * slice_stage.n_steps
 
     def fit(number: int) -> SliceFit:
-        start, alone = first, context.alone(lambda done, total: context.progress(number * total + done, n_steps))
+        start = first
         if number:
             start = fit_to_prior(
                 prior,
                 spacing_mm=first.spacing_mm * SPACINGS[number % len(SPACINGS)],
                 stage=prior_stage,
-                context=context.alone(),
+                context=replace(context, progress=no_progress, observer=None),
                 shift=np.modf(number * np.array(SHIFT))[0],
             )
         return fit_slices(
@@ -79,7 +80,11 @@ def fit_lattices(
             weight=weight,
             prior=held,
             settings=slice_stage,
-            context=alone if number else replace(alone, observer=context.observer),
+            context=replace(
+                context,
+                progress=lambda done, total: context.progress(number * total + done, n_steps),
+                observer=None if number else context.observer,
+            ),
             pixel_weight=target.pixel_weight,
         )
 
