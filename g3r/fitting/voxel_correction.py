@@ -5,11 +5,13 @@
 V_0 is the mixture of Gaussians and V_prior, A the voxel operator with the profiles of the fit, y the pixels without
 gains and fields, r the mean coverage of a voxel. Gaussians lie further apart than voxels, so an edge between two of
 them comes out too soft. The correction D = V - V_0 sharpens it as far as the slices require it against h and s.
+
+How well V_0 shows a head differs: h is low where generalised cross-validation finds that V_0 is in the way.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +29,25 @@ compared (as in `uncertainty.prior_share`). Of wider changes less stays; of this
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelCorrectionSettings(VoxelProblemSettings):
-    """Settings of the correction; intensities are normalised."""
+    """Settings of the correction; intensities are normalised.
+
+    Args:
+        loosens: whether `LOOSE` is used instead where cross-validation prefers it. Never for a single stack, since it
+            would take errors of poses for detail.
+    """
 
     hold: float = 0.6
     total_variation: float = 0.015
     tip: float = 0.02
     n_rounds: int = 2
     n_iterations: int = 8
+    loosens: bool = True
+
+
+TIGHT = VoxelCorrectionSettings()
+LOOSE = replace(TIGHT, hold=0.15)
+"""The two that cross-validation compares, on V_0 from one fit. With less total variation it prefers less of a pull in
+all heads, with more of it more, and against the mean of several fits, whose freedom it does not know, none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +56,12 @@ class VoxelCorrectionRecord:
 
     Attributes:
         hold: the hold in use, adapted to the noise of the slices.
+        loose_error: error of predictions with `LOOSE` over that with `TIGHT`, by cross-validation; None if not asked.
         size: root mean square of the correction in the brain, in normalised intensities.
     """
 
     hold: float
+    loose_error: float | None
     size: float
 
 
@@ -66,6 +82,7 @@ class VoxelCorrection:
 
 def correct_on_voxels(
     volume: Float32Array,
+    of_one_fit: Float32Array,
     fit: SliceFit,
     pixel_weight: Float32Array,
     grid: VolumeGrid,
@@ -77,25 +94,46 @@ def correct_on_voxels(
 
     Args:
         volume: V_0 [I, J, K].
+        of_one_fit: [I, J, K] V_0 with the Gaussians of the first fit alone; the same unless it is a mean of several.
         fit: slices with profiles, poses, gains and fields.
         pixel_weight: [P] of the fit.
         grid: of the volume.
         reach: [I, J, K] from 0 to 1, how much of the correction counts: 0 where there are no Gaussians or slices.
         settings: hold, strength of total variation, and numbers of steps.
-        rng: draws the change that measures `kept`.
+        rng: draws the change that measures `kept`, and the probe of cross-validation.
     """
     whole = FitPixels.of(fit, fit.slices, pixel_weight)
-    # pose errors of a single stack count as noise: no other stack checks its poses
-    chosen = settings.for_noise((whole.error if fit.slices.n_stacks == 1 else whole.noise)(volume, grid))
-    problem = VoxelProblem(whole, grid, chosen)
+    loose_error = None
+    if fit.slices.n_stacks == 1:
+        # pose errors of a single stack count as noise: no other stack checks its poses
+        noise = whole.error(volume, grid)
+    else:
+        noise = whole.noise(volume, grid)
+        if settings.loosens:
+            loose_error = _loose_error(whole, grid, of_one_fit, noise, rng)
+    asked = settings if loose_error is None or loose_error >= 1 else LOOSE
+    problem = VoxelProblem(whole, grid, asked.for_noise(noise))
     found = problem.solved(volume)
     values = ((found - volume) * reach).astype(np.float16)
     inside = reach > 0
     size = float(np.sqrt((values[inside].astype(np.float64) ** 2).mean())) if inside.any() else 0.0
     kept = 1 - reach * (1 - _kept(problem, found, rng))
-    return VoxelCorrection(
-        values=values, kept=kept, record=VoxelCorrectionRecord(hold=round(chosen.hold, 3), size=round(size, 5))
+    record = VoxelCorrectionRecord(
+        hold=round(problem.settings.hold, 3),
+        loose_error=None if loose_error is None else round(loose_error, 4),
+        size=round(size, 5),
     )
+    return VoxelCorrection(values=values, kept=kept, record=record)
+
+
+def _loose_error(
+    pixels: FitPixels, grid: VolumeGrid, volume: Float32Array, noise: float, rng: np.random.Generator
+) -> float:
+    """Error of predictions with `LOOSE` over that with `TIGHT`, by generalised cross-validation."""
+    probe = rng.standard_normal(len(pixels.value)).astype(np.float32)
+    loose, tight = (VoxelProblem(pixels, grid, one.for_noise(noise)) for one in (LOOSE, TIGHT))
+    errors = [one.cross_validation(one.solved(volume), probe) for one in (loose, tight)]
+    return errors[0] / max(errors[1], 1e-30)
 
 
 def _kept(problem: VoxelProblem, found: Float32Array, rng: np.random.Generator) -> Float32Array:

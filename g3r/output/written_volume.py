@@ -200,6 +200,7 @@ def corrected(
     widths = found.held_out.widths if found.held_out else None
     target = slice_target(prior, found.registration.weight, settings.slice_model, widths)
     here = volume if mixture.grid is mixture.prior_grid else mixture.volume(cloud, mixture.prior_grid)
+    of_one_fit = mixture.volume(fit.cloud, mixture.prior_grid) if fit.further else here
     rng = stage_rng(settings.seed, Stage.VOLUME)
     reach = mixture.reach()
-    return correct_on_voxels(here, fit, target.pixel_weight, mixture.prior_grid, reach, asked, rng)
+    return correct_on_voxels(here, of_one_fit, fit, target.pixel_weight, mixture.prior_grid, reach, asked, rng)

@@ -15,7 +15,7 @@ from g3r.fitting.voxel_problem import QUIET, too_fine
 from g3r.geometry import VolumeGrid
 from tests.fitting.scene import BALL, GRID, INDEX, make_slices, true_cloud, true_volume
 
-SETTINGS = VoxelCorrectionSettings(n_iterations=20)
+SETTINGS = VoxelCorrectionSettings(n_iterations=20, loosens=False)
 REACH = BALL.astype(np.float32)
 CORE = (GRID.world(INDEX) ** 2).sum(-1) < 7.0**2
 """Voxels away from the rim, where slices end."""
@@ -38,7 +38,7 @@ def correction(
 ) -> VoxelCorrection:
     fit = fit or fit_of()
     weight = fit.slices.mask.astype(np.float32)
-    return correct_on_voxels(volume, fit, weight, GRID, reach, settings, np.random.default_rng(0))
+    return correct_on_voxels(volume, volume, fit, weight, GRID, reach, settings, np.random.default_rng(0))
 
 
 def rms(values: NDArray[np.floating]) -> float:
@@ -107,8 +107,10 @@ def test_fine_voxels_show_no_grid_of_pixels() -> None:
     for voxel_mm, pattern in ((0.8, 0.1), (0.59, 0.25)):
         grid = VolumeGrid.isotropic([-11] * 3, [11] * 3, voxel_mm)
         inside = (grid.world(np.moveaxis(np.indices(grid.shape), 0, -1)) ** 2).sum(-1) < 7.0**2
+        flat = np.full(grid.shape, 0.5, np.float32)
         found = correct_on_voxels(
-            np.full(grid.shape, 0.5, np.float32),
+            flat,
+            flat,
             replace(fit, slices=slices),
             slices.mask.astype(np.float32),
             grid,
