@@ -103,17 +103,18 @@ def correct_on_voxels(
         rng: draws the change that measures `kept`, and the probe of cross-validation.
     """
     whole = FitPixels.of(fit, fit.slices, pixel_weight)
-    loose_error = None
+    loose_error: float | None = None
+    solved: dict[VoxelCorrectionSettings, Float32Array] = {}
     if fit.slices.n_stacks == 1:
         # pose errors of a single stack count as noise: no other stack checks its poses
         noise = whole.error(volume, grid)
     else:
         noise = whole.noise(volume, grid)
         if settings.loosens:
-            loose_error = _loose_error(whole, grid, of_one_fit, noise, rng)
+            loose_error, solved = _compared(whole, grid, of_one_fit, noise, rng)
     asked = settings if loose_error is None or loose_error >= 1 else LOOSE
     problem = VoxelProblem(whole, grid, asked.for_noise(noise))
-    found = problem.solved(volume)
+    found = solved[asked] if of_one_fit is volume and asked in solved else problem.solved(volume)
     values = ((found - volume) * reach).astype(np.float16)
     inside = reach > 0
     size = float(np.sqrt((values[inside].astype(np.float64) ** 2).mean())) if inside.any() else 0.0
@@ -126,14 +127,17 @@ def correct_on_voxels(
     return VoxelCorrection(values=values, kept=kept, record=record)
 
 
-def _loose_error(
+def _compared(
     pixels: FitPixels, grid: VolumeGrid, volume: Float32Array, noise: float, rng: np.random.Generator
-) -> float:
-    """Error of predictions with `LOOSE` over that with `TIGHT`, by generalised cross-validation."""
+) -> tuple[float, dict[VoxelCorrectionSettings, Float32Array]]:
+    """Error of predictions with `LOOSE` over that with `TIGHT`, by generalised cross-validation, and both solutions."""
     probe = rng.standard_normal(len(pixels.value)).astype(np.float32)
-    loose, tight = (VoxelProblem(pixels, grid, one.for_noise(noise)) for one in (LOOSE, TIGHT))
-    errors = [one.cross_validation(one.solved(volume), probe) for one in (loose, tight)]
-    return errors[0] / max(errors[1], 1e-30)
+    errors, solved = [], {}
+    for settings in (LOOSE, TIGHT):
+        problem = VoxelProblem(pixels, grid, settings.for_noise(noise))
+        solved[settings] = problem.solved(volume)
+        errors.append(problem.cross_validation(solved[settings], probe))
+    return errors[0] / max(errors[1], 1e-30), solved
 
 
 def _kept(problem: VoxelProblem, found: Float32Array, rng: np.random.Generator) -> Float32Array:

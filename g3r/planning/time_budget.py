@@ -66,7 +66,7 @@ output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
-CORRECTION_OVER_COARSE, EDGE_OVER_COARSE = 0.8, 0.4
+CORRECTION_OVER_COARSE, EDGE_OVER_COARSE = 1.7, 0.4
 """Seconds of the correction on voxels, and of the edge by the image, over those of V_coarse and V_sharp."""
 
 VOLUME_AT_END = 0.15
