@@ -91,13 +91,11 @@ def test_the_pull_is_loose_where_the_volume_lacks_detail_alone() -> None:
     assert lacking.hold / complete.hold == pytest.approx(LOOSE.hold / TIGHT.hold, rel=0.5)
 
 
-def test_one_stack_and_fixed_settings_are_not_asked() -> None:
-    for record in (
-        corrected(SOFT, noisy_fit(1, n_stacks=1)),
-        corrected(SOFT, noisy_fit(1), replace(TIGHT, loosens=False)),
-    ):
-        assert record.loose_error is None
-        assert record.hold >= TIGHT.hold
+@pytest.mark.parametrize(("n_stacks", "loosens"), [(1, True), (2, True), (3, False)])
+def test_few_stacks_and_fixed_settings_are_not_asked(n_stacks: int, loosens: bool) -> None:
+    record = corrected(SOFT, noisy_fit(1, n_stacks), replace(TIGHT, loosens=loosens))
+    assert record.loose_error is None
+    assert record.hold >= TIGHT.hold
 
 
 def test_other_settings_hold_as_they_are_where_the_volume_is_good() -> None:
