@@ -46,11 +46,11 @@ class VoxelCorrectionSettings(VoxelProblemSettings):
 
 TIGHT = VoxelCorrectionSettings()
 LOOSE = replace(TIGHT, hold=0.15)
-"""The two that cross-validation compares, on V_0 from one fit. With less total variation it prefers less of a pull in
-all heads, with more of it more, and against the mean of several fits, whose freedom it does not know, none."""
+"""The two that cross-validation compares, on V_0 from one fit. It cannot choose total variation, of which it prefers
+less in all heads, and it hardly tells against the mean of several fits, whose freedom it does not know."""
 
 CLEARLY = 0.997
-"""`LOOSE` is taken if it has at most this share of the error of `TIGHT`. Phantoms, which gain, have 0.988 to 0.995,
+"""`LOOSE` is taken if it has at most this share of the error of `TIGHT`. Phantoms, which gain, have 0.988 to 0.993,
 heads of atlases, which would lose, 0.999 to 1.030."""
 
 ENOUGH_STACKS = 3
