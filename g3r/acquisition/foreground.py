@@ -50,10 +50,9 @@ SEEN_SHARE = 1 / 3
 """Coverage below which a voxel is unseen, as a share of the average coverage of one stack. With the smoothing over half
 the slice spacing, seen voxels end 0.75 of the spacing beyond a stack's last slice."""
 
-POSSIBLE_MM = 4.0
+POSSIBLE_MM = 1.6
 """How far beyond the mask unseen voxels may be shown. Beyond all slices, at the border of the grid, the network is
-unreliable: two of 16 phantoms showed a slab of 10 ml there, with a brain probability of 0.25 to 0.5, that touched the
-brain stem."""
+unreliable: it may show a slab there, with a brain probability of 0.25 to 0.5, around the end of the brain stem."""
 
 THIN_MARGIN_VOXELS = 2
 
@@ -86,7 +85,7 @@ class Foreground:
     unseen: NDArray[np.bool_]
     thin: NDArray[np.bool_]
     rim_voxels: int = 1
-    possible_voxels: int = 5
+    possible_voxels: int = 2
 
     def edge(
         self, support: NDArray[np.bool_], mask: NDArray[np.bool_], brain_probability: NDArray[np.floating] | None = None
@@ -94,22 +93,25 @@ class Foreground:
         """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
 
         Args:
-            support: [I, J, K] where the volume is fitted; where slices hardly looked, it is shown there in full.
+            support: [I, J, K] where the volume is fitted.
             mask: [I, J, K] the brain with its holes filled, shown in full.
-            brain_probability: see `mask`; a lower bound of the brain share where slices hardly looked.
+            brain_probability: see `mask`; a lower bound of the brain share where slices hardly looked. Without it the
+                support is shown in full there.
         """
         low, high = EDGE
-        share = self.share
-        if brain_probability is not None:
-            share = np.where(self.unseen | self.thin, np.maximum(share, brain_probability), share)
+        share, full, hardly_seen = self.share, mask, self.unseen | self.thin
+        if brain_probability is None:
+            full = mask | (hardly_seen & support)
+        else:
+            share = np.where(hardly_seen, np.maximum(share, brain_probability), share)
         faded = np.clip((share - low) / (high - low), 0, 1)
         near = binary_dilation(mask | support, iterations=self.rim_voxels)
-        return np.maximum(faded * near, mask | ((self.unseen | self.thin) & support)).astype(np.float16)
+        return np.maximum(faded * near, full).astype(np.float16)
 
     def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.
 
-        With a network the margin is wider where slices hardly looked: the network's image ends with the brain.
+        With a network the margin is wider where slices hardly looked; `edge` hides what is no brain there.
 
         Args:
             brain_probability: see `mask`.

@@ -136,6 +136,23 @@ def test_what_is_merely_possible_is_shown_beside_the_mask_alone() -> None:
     assert found.support(0.6 * possible)[2:27].all()
 
 
+def test_what_slices_hardly_saw_is_shown_where_the_network_expects_brain() -> None:
+    brain, thin = np.zeros((12, 9, 9), bool), np.zeros((12, 9, 9), bool)
+    brain[2:6], thin[6:10] = True, True
+    found = replace(beside_nothing(brain, ~brain), thin=thin)
+    probability = np.zeros(brain.shape)
+    probability[6, :4] = 0.4
+    support = found.support(probability)
+    assert support[6:8].all()  # fitted there with a margin of two voxels
+    edge = found.edge(support, found.mask(probability), probability)
+    assert (edge[2:6] == 1).all()
+    assert (edge[6, :4] == 1).all()
+    assert not edge[6, 4:].any()
+    assert not edge[7:].any()
+    # without a network nothing tells where the brain ends
+    assert (found.edge(support, found.mask(), None)[6:8] == 1).all()
+
+
 def test_a_factor_common_to_all_weights_says_nothing() -> None:
     slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0), ellipsoid_stack(TURNS[1], low_mm=-10.0)])
     one = foreground(slices, GRID)
