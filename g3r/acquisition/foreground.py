@@ -95,8 +95,7 @@ class Foreground:
         Args:
             support: [I, J, K] where the volume is fitted.
             mask: [I, J, K] the brain with its holes filled, shown in full.
-            brain_probability: see `mask`; a lower bound of the brain share where slices hardly looked. Without it the
-                support is shown in full there.
+            brain_probability: see `mask`; decides where slices hardly looked. Without it the support is shown there.
         """
         low, high = EDGE
         share, full, hardly_seen = self.share, mask, self.unseen | self.thin
