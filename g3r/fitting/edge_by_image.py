@@ -5,10 +5,10 @@ if there were brain. Where nothing but black lies beside the brain, a pixel of t
 it: its value over the value that it would have if all beneath it were brain. The share f of brain in the voxels
 minimises
 
-    sum_p w_p (A V)_p^2 (A f - y / A V)_p^2  +  r s |grad f|
+    sum_p w_p (A f - y / A V)_p^2  +  r s |grad f|
 
 over masked pixels and those beside them, with V the volume, continued beyond its edge. Total variation keeps the edge
-sharp. Where stacks show skull, fluid and mother, nothing is found, and masks alone decide (`acquisition.foreground`).
+sharp. Dark pixels count like bright ones: V is a guess there, and wrong by a proportion more than by noise. Where stacks show skull, fluid and mother, nothing is found, and masks alone decide (`acquisition.foreground`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SHARES = (0.2, 0.5)
 """Shares of brain between which the volume fades in. On eight development cases (docs/method.md, "Mask") half of a
 voxel, where the edge lies, would be best on the whole grid; but a voxel of the brain that is lost costs more."""
 
-SETTINGS = VoxelProblemSettings(hold=0.01, total_variation=0.1, tip=0.05, n_rounds=3, n_iterations=10)
+SETTINGS = VoxelProblemSettings(hold=0.003, total_variation=0.13, tip=0.05, n_rounds=3, n_iterations=10)
 
 FULL_MM = 1.5
 """Deeper inside the support than this, the volume is shown in full: what is dark there is fluid."""
@@ -54,7 +54,7 @@ standard deviations, which may be more than `BRIGHT_SHARE` of the brain, at an S
 beside the brain is brighter, it is not noise."""
 
 LEAST_PREDICTED = 0.1
-"""Lower bound, in normalised intensities, of the prediction that a pixel is divided by: darker ones show no share."""
+"""Prediction, in normalised intensities, below which a pixel shows no share."""
 
 
 def shown_by_image(
@@ -82,11 +82,10 @@ def shown_by_image(
     if pixels is None:
         return None
     predicted = pixels.operator(grid).forward(_continued(volume, edge, depth_mm, grid))
-    power = float((volume[support].astype(np.float64) ** 2).mean())
     asked = replace(
         pixels,
         value=np.clip(pixels.value / np.maximum(predicted, LEAST_PREDICTED), 0, 1.2).astype(np.float32),
-        weight=(pixels.weight * predicted**2 / power).astype(np.float32),
+        weight=np.where(predicted > LEAST_PREDICTED, pixels.weight, 0).astype(np.float32),
     )
     share = VoxelProblem(asked, grid, SETTINGS).solved(edge.astype(np.float32))
     low, high = SHARES
