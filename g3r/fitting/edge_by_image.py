@@ -8,7 +8,8 @@ minimises
     sum_p w_p (A f - y / A V)_p^2  +  r s |grad f|
 
 over masked pixels and those beside them, with V the volume, continued beyond its edge. Total variation keeps the edge
-sharp. Dark pixels count like bright ones: V is a guess there, and wrong by a proportion more than by noise. Where stacks show skull, fluid and mother, nothing is found, and masks alone decide (`acquisition.foreground`).
+sharp. Dark pixels count like bright ones: V is a guess there, and wrong by a proportion more than by noise. Where
+stacks show skull, fluid and mother, nothing is found, and masks alone decide (`acquisition.foreground`).
 """
 
 from __future__ import annotations
