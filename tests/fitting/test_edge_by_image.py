@@ -27,11 +27,15 @@ NEAR = RADIUS_MM < SUPPORT_MM + 1
 
 
 def slices_that_see(
-    beside: float, gain: NDArray[np.float64] | None = None, noise: float = 0.01, mask_mm: float = SUPPORT_MM
+    beside: float,
+    gain: NDArray[np.float64] | None = None,
+    noise: float = 0.01,
+    mask_mm: float = SUPPORT_MM,
+    tissue: NDArray[np.float64] = TISSUE,
 ) -> Slices:
     """Three stacks of a ball of tissue with a given intensity beside it."""
     planes = stack_planes(14, 2.0, 30)
-    scene = np.where(RADIUS_MM < BRAIN_MM, TISSUE, beside).astype(np.float32)
+    scene = np.where(RADIUS_MM < BRAIN_MM, tissue, beside).astype(np.float32)
     operator = VoxelOperator(planes, GRID, np.arange(planes.n_pixels), (3, 3, 5))
     value = operator.forward(scene)
     if gain is not None:
@@ -43,7 +47,10 @@ def slices_that_see(
 
 
 def shown(
-    slices: Slices, gain: NDArray[np.float64] | None = None, bias_field: list[list[float]] | None = None
+    slices: Slices,
+    gain: NDArray[np.float64] | None = None,
+    bias_field: list[list[float]] | None = None,
+    tissue: NDArray[np.float64] = TISSUE,
 ) -> NDArray[np.float32] | None:
     """Edge of a volume that extends beyond the brain, as a volume fitted to masked pixels does."""
     ones = np.ones(len(slices))
@@ -56,7 +63,7 @@ def shown(
         bias_field=bias_field or [],
     )
     edge = np.where(NEAR, 1, 0).astype(np.float16)
-    volume = (TISSUE * NEAR).astype(np.float32)
+    volume = (tissue * NEAR).astype(np.float32)
     return shown_by_image(volume, edge, SUPPORT, GRID, fit, slices)
 
 
@@ -85,7 +92,17 @@ def test_gains_and_noise_do_not_move_the_edge() -> None:
     very_noisy = errors(shown(slices_that_see(0.0, noise=0.12)))
     np.testing.assert_allclose(uneven, even, atol=0.03)
     np.testing.assert_allclose(noisy, even, atol=0.1)
-    np.testing.assert_allclose(very_noisy, even, atol=0.3)  # mean of such noise: a quarter of tissue
+    np.testing.assert_allclose(very_noisy, even, atol=0.3)  # the mean of such noise in black: a quarter of tissue
+
+
+def test_the_edge_of_dark_tissue_is_found_as_well() -> None:
+    x = GRID.world(np.moveaxis(np.indices(GRID.shape), 0, -1))[..., 0]
+    tissue = np.where(x < 0, 0.2, 0.9)
+    found = shown(slices_that_see(0.0, tissue=tissue), tissue=tissue)
+    assert found is not None
+    beside = (RADIUS_MM > BRAIN_MM + 0.5) & NEAR
+    assert found[beside & (x > 1)].mean() < 0.02
+    assert found[beside & (x < -1)].mean() < 0.02
 
 
 def test_the_field_of_the_fit_is_that_of_its_masks() -> None:
