@@ -34,8 +34,10 @@ so pixels get nodes in plane as well. Below the second these leave holes, too, a
 QUIET = 0.03
 """Standard deviation of noise, in normalised intensities, up to which the settings hold as they are: a little more than
 that of stacks with a signal-to-noise ratio of 20 (0.024), since detail that a volume lacks counts as noise, too.
-Noisier slices count less, by the square of their noise, as in a MAP estimate: with a ratio of 5 and two stacks of a
-simulated subject an unchanged hold cost 0.6 dB against no correction."""
+In noisier slices total variation grows with the square of their noise, as in a MAP estimate, and the hold with the
+noise itself, since V_0 is made from the same slices and noisier, too. With a ratio of 5 or 6 a hold that grows with
+the square cost 0.2 to 0.8 dB, one that does not grow at all up to 0.6 dB (docs/method.md, "The correction on
+voxels")."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +62,8 @@ class VoxelProblemSettings:
 
     def for_noise(self, noise: float) -> Self:
         """The settings for slices with a standard deviation of noise, in normalised intensities, see `QUIET`."""
-        by = max(1.0, noise / QUIET) ** 2
-        return replace(self, hold=by * self.hold, total_variation=by * self.total_variation)
+        by = max(1.0, noise / QUIET)
+        return replace(self, hold=by * self.hold, total_variation=by**2 * self.total_variation)
 
 
 def too_fine(voxel_mm: float, slices: Slices) -> bool:
