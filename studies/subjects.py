@@ -117,6 +117,11 @@ def data_folder(part: str) -> Path:
     return folder
 
 
+def is_named(name: str, patterns: Sequence[str]) -> bool:
+    """Whether a part of a name matches one of the patterns of --cases."""
+    return any(fnmatch(name, f"*{pattern}*") for pattern in patterns)
+
+
 def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path]:
     """The cases of the test data whose name has a part that matches a pattern, by increasing motion.
 
@@ -124,7 +129,7 @@ def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path
         InputError: none matches.
     """
     root = root or data_folder("cases")
-    found = [f for f in sorted(root.glob("*")) if f.is_dir() and any(fnmatch(f.name, f"*{p}*") for p in patterns)]
+    found = [f for f in sorted(root.glob("*")) if f.is_dir() and is_named(f.name, patterns)]
     if not found:
         raise InputError(f"{root}: no case named {' or '.join(patterns)}; change --cases or G3R_TEST_DATA")
     return sorted(found, key=lambda f: next((n for n, p in enumerate(ORDER) if fnmatch(f.name, p)), len(ORDER)))

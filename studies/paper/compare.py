@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from fnmatch import fnmatch
 from pathlib import Path
 from statistics import mean
 
@@ -18,6 +17,7 @@ from studies.paper.peers import measure_peer, peer
 from studies.paper.scores import why_no_lpips
 from studies.paper.subjects import N_SUBJECTS, PaperSubject, atlas_heads, phantom_heads
 from studies.paper.tables import CONDITIONS, main_tables, stages_table, variants_table
+from studies.subjects import is_named
 from studies.tables import stacks
 
 STACK_NUMBERS = (3, 2, 1)
@@ -33,7 +33,7 @@ def heads(motion: str, options: argparse.Namespace) -> list[PaperSubject]:
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """The tasks of `all_tasks` whose key has a part that matches --cases."""
     for task in all_tasks(options):
-        if any(fnmatch(task.key, f"*{pattern}*") for pattern in options.cases):
+        if is_named(task.key, options.cases):
             yield task
 
 

@@ -27,7 +27,7 @@ from studies.stress.outcome import (
     says_unseen,
     verdicts,
 )
-from studies.subjects import SubjectSpec, simulated_case
+from studies.subjects import SubjectSpec, is_named, simulated_case
 from studies.tables import Cell, details, table
 
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
@@ -127,13 +127,14 @@ def subject_of(condition: Condition, n: int) -> StressedSubject:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Tasks for every condition of the first subject, then of the next.
+    """Tasks for every condition that --cases names of the first subject, then of the next.
 
     The conditions of an interrupted study then have the same subjects.
     """
     for n in range(options.subjects):
         for condition in CONDITIONS:
-            yield Task(f"{condition.name} {n}", measure, (condition.name, n, options))
+            if is_named(key := f"{condition.name} {n}", options.cases):
+                yield Task(key, measure, (condition.name, n, options))
 
 
 def measure(name: str, n: int, options: argparse.Namespace) -> Row:
@@ -222,7 +223,7 @@ STUDY = Study(
     name="stress.sweep",
     about="Make one thing wrong at a time in simulated stacks: what it costs, and whether the verdict notices.",
     document="stress.md",
-    shared=(*FITS, "--jobs", "--cache"),
+    shared=(*FITS, "--jobs", "--cache", "--cases"),
     options={"--subjects": {"type": int, "default": 3, "metavar": "N", "help": "heads of each condition"}},
     tasks=tasks,
     line=line,

@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from fnmatch import fnmatch
 from itertools import pairwise
 from statistics import mean
 from typing import Any
@@ -15,7 +14,7 @@ from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
 from studies.harness import Record, Row, Study, Task
 from studies.runs import aligned, figures
-from studies.subjects import SizedSubject, simulated_case
+from studies.subjects import SizedSubject, is_named, simulated_case
 from studies.tables import Cell, table
 from studies.tradeoff.presets_figure import draw_presets
 
@@ -54,7 +53,7 @@ FEWER_STACKS = "balanced"
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """The tasks of `all_tasks` whose key has a part that matches --cases."""
     for task in all_tasks(options):
-        if any(fnmatch(task.key, f"*{pattern}*") for pattern in options.cases):
+        if is_named(task.key, options.cases):
             yield task
 
 

@@ -156,3 +156,9 @@ def test_the_table_of_draws_counts_stacks_that_were_spoilt() -> None:
     for pixels, said in ((2, "0 name what is wrong with the stacks, 1 are"), (-2, "1 name what is wrong")):
         only = {"rows": {"0": masks | {"mask_pixels": pixels}}}
         assert said in drawn.tables(record | only)["stress-drawn"]
+
+
+def test_cases_choose_conditions_of_each_subject() -> None:
+    options = sweep.STUDY.parser().parse_args(["--cases", "noise", "--subjects", "2"])
+    expected = [f"noise: SNR {snr} {n}" for n in range(2) for snr in (10, 5)]
+    assert [task.key for task in sweep.tasks(options)] == expected
