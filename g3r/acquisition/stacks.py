@@ -14,25 +14,13 @@ from numpy.typing import NDArray
 from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
-from g3r.acquisition.psf import IN_PLANE_FWHM_RANGE_PIXELS, THICKNESS_RANGE_MM
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
+from g3r.acquisition.stack_checks import check_arrays, check_grid, check_intensities, check_profile, spaced
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
 
 logger = logging.getLogger(__name__)
-
-ORTHOGONALITY_TOLERANCE = 1e-3
-"""Largest cosine between two axes of a stack; headers of scanners keep about 1e-5."""
-
-SPACING_RANGE_MM = (0.05, 50.0)
-"""Allowed spacing of pixels and slices; headers in metres or micrometres are outside."""
-
-INTENSITY_RANGE = (1e-30, 1e30)
-"""Allowed range of the largest value inside a mask, so that float32 can be divided by it."""
-
-MIN_POSITIVE_SHARE = 0.01
-"""Smallest share of masked values that must be positive: intensities are normalised by their 99th percentile."""
 
 MaskOfStack = str | os.PathLike[str] | FoundMask | Callable[[Volume], FoundMask]
 """The mask of a stack: its file, a mask that was found, or a function that finds it."""
@@ -83,57 +71,11 @@ class Stack:
         image = np.asarray(self.image, dtype=np.float32)
         mask = np.asarray(self.mask, dtype=bool)
         affine = np.array(self.affine, dtype=np.float64)
-        if image.ndim != 3:
-            raise InputError(f"{self.name}: has shape {image.shape}; expected a 3D stack of slices")
-        if mask.shape != image.shape:
-            raise InputError(f"{self.name}: mask has shape {mask.shape}, image {image.shape}; expected the same")
-        if image.shape[2] < 2:
-            raise InputError(f"{self.name}: holds {image.shape[2]} slice; expected a stack of at least 2")
-        try:
-            grid = VolumeGrid(image.shape, affine)
-        except ValueError as error:
-            raise InputError(f"{self.name}: bad header ({error}); fix the sform or qform") from None
-        spacing, shear = grid.spacing_mm, grid.shear
-        low, high = SPACING_RANGE_MM
-        if not (low <= spacing.min() and spacing.max() <= high):
-            raise InputError(
-                f"{self.name}: voxels of {spaced(spacing)} mm; expected {low:g} to {high:g} mm, check the "
-                "header (units, pixdim, sform)"
-            )
-        if shear > ORTHOGONALITY_TOLERANCE:
-            raise InputError(f"{self.name}: axes are sheared (cosine {shear:.2g}); resample to orthogonal axes")
-        low, high = THICKNESS_RANGE_MM
-        if not (np.isfinite(self.thickness_mm) and low <= self.thickness_mm <= high):
-            raise InputError(
-                f"{self.name}: slice thickness {self.thickness_mm:g} mm; expected {low:g} to {high:g} mm, "
-                "pass --thickness"
-            )
-        low, high = IN_PLANE_FWHM_RANGE_PIXELS
         widths = tuple(float(width) for width in self.in_plane_fwhm_pixels)
-        if len(widths) != 2 or not all(low <= width <= high for width in widths):
-            raise InputError(
-                f"{self.name}: in-plane FWHM of {widths} pixels; expected two numbers from {low:g} to {high:g}, "
-                "for the two axes of a slice"
-            )
-        if not mask.any():
-            raise InputError(f"{self.name}: mask is empty; expected the brain to be marked")
-        inside = image[mask]
-        n_bad = int((~np.isfinite(inside)).sum())
-        if n_bad:
-            raise InputError(f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out")
-        if inside.size > 1 and inside.min() == inside.max():
-            raise InputError(f"{self.name}: every value inside the mask is {inside[0]:g}; expected an image")
-        if np.count_nonzero(inside > 0) < MIN_POSITIVE_SHARE * inside.size:
-            raise InputError(
-                f"{self.name}: hardly a value inside the mask is positive (the largest is {inside.max():g}); "
-                "expected a magnitude image"
-            )
-        low, high = INTENSITY_RANGE
-        if not low <= inside.max() <= high:
-            raise InputError(
-                f"{self.name}: largest value inside the mask is {inside.max():g}; expected {low:g} to "
-                f"{high:g}, scale the image"
-            )
+        check_arrays(image, mask, self.name)
+        check_grid(image.shape, affine, self.name)
+        check_profile(self.thickness_mm, widths, self.name)
+        check_intensities(image, mask, self.name)
         object.__setattr__(self, "image", np.where(np.isfinite(image), image, np.float32(0)))
         object.__setattr__(self, "mask", mask)
         object.__setattr__(self, "affine", affine)
@@ -267,11 +209,6 @@ def load_stacks(
             _check_pair(stack, other, Path(path), Path(other_path))
         stacks.append(stack)
     return stacks
-
-
-def spaced(lengths: NDArray[np.float64]) -> str:
-    """Lengths for messages, such as 0.8 x 0.8 x 3."""
-    return " x ".join(f"{x:.3g}" for x in lengths)
 
 
 def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume, load_volume, read_mask
 from g3r.acquisition.nifti import NO_ORIENTATION
-from g3r.acquisition.stacks import ORTHOGONALITY_TOLERANCE, SPACING_RANGE_MM, spaced
+from g3r.acquisition.stack_checks import ORTHOGONALITY_TOLERANCE, SPACING_RANGE_MM, spaced
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 from g3r.geometry.rigid import orthonormal

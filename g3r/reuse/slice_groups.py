@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.stacks import spaced
+from g3r.acquisition.stack_checks import spaced
 from g3r.errors import InputError
 from g3r.geometry.rigid import orthonormal
 from g3r.registration.pose_sampling import angle_deg

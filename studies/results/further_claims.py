@@ -17,13 +17,12 @@ SEEDS = 3
 """Least number of trainings of a variant that shows more than chance."""
 
 
-EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject", "stress-drawn-later": "Every subject"}
+EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject"}
 """Title of the table of all runs, by block."""
 
 AT_ONCE = {
     "stress-sweep": ", one thing wrong at a time on heads that limits were set on",
-    "stress-drawn": ", all drawn at once on heads that limits were set on",
-    "stress-drawn-later": ", all drawn at once again with one limit raised on two of these",
+    "stress-drawn": ", all drawn at once",
 }
 """Words about the study in its claims, by block."""
 
