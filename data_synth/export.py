@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from g3r.errors import InputError, cannot_be_written
 from g3r.run.output_folder import FOUND_ON_DISKS, OutputFolder
 
 POSE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "void")
+
+OF_SUBJECT = {"truth.nii.gz", "truth-mask.nii.gz", "poses.tsv", "poses.json", "simulation.json"}
+OF_STACK = re.compile(r"(stack|mask)-\d+\.nii\.gz")
+"""Names of the files of a simulated subject, and those of its stacks."""
 
 
 def save_simulation(
@@ -40,13 +45,13 @@ def save_simulation(
         truth: the volume that was sliced.
         stacks: simulated from it.
         record: settings, written with the data.
-        replace: whether a folder that already holds files may be replaced.
+        replace: whether an earlier simulation may be replaced; other files of the folder stay.
 
     Raises:
         InputError: the folder exists and is not empty (without `replace`), or cannot be written.
     """
     check_output(folder, replace=replace)
-    with OutputFolder(folder) as run:
+    with OutputFolder(folder, _names(folder, len(stacks))) as run:
         check_output(folder, replace=replace)
         try:
             with run.result() as staging:
@@ -58,7 +63,7 @@ def save_simulation(
 def check_output(folder: Path, *, replace: bool) -> None:
     """Refuse an output that is a file, or a non-empty folder that may not be replaced.
 
-    A folder to be replaced must hold an earlier simulation (a `poses.tsv`), so that nothing else is ever deleted.
+    A folder to be replaced must hold an earlier simulation (a `poses.tsv`). What else it holds stays.
 
     Raises:
         InputError: see above.
@@ -72,6 +77,12 @@ def check_output(folder: Path, *, replace: bool) -> None:
         raise InputError(f"{folder}: is not empty; pass --force to replace it, or choose another --output")
     if content and "poses.tsv" not in content:
         raise InputError(f"{folder}: holds something else than a simulation; choose another --output")
+
+
+def _names(folder: Path, n_stacks: int) -> set[str]:
+    """Names of files of a simulation: of the one to come, and of the one in the folder, if any."""
+    earlier = {path.name for path in folder.iterdir() if OF_STACK.fullmatch(path.name)} if folder.is_dir() else set()
+    return earlier | OF_SUBJECT | {f"{kind}-{n}.nii.gz" for kind in ("stack", "mask") for n in range(n_stacks)}
 
 
 def _write(folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], record: Mapping[str, object]) -> None:

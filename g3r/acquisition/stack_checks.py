@@ -44,7 +44,7 @@ def check_arrays(image: NDArray[np.float32], mask: NDArray[np.bool_], name: str)
 def check_grid(shape: tuple[int, ...], affine: NDArray[np.float64], name: str) -> None:
     """Raise `InputError` unless an affine [4, 4] has orthogonal axes and voxels that can be in mm."""
     try:
-        grid = VolumeGrid(shape, affine)
+        grid = VolumeGrid((shape[0], shape[1], shape[2]), affine)
     except ValueError as error:
         raise InputError(f"{name}: bad header ({error}); fix the sform or qform") from None
     spacing, shear = grid.spacing_mm, grid.shear

@@ -7,7 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from g3r.bids.dataset import Session, find_masks
@@ -18,11 +18,15 @@ from g3r.bids.outcome import failure_path, log_path, write_failure
 from g3r.bids.sidecars import inherited, with_sidecar
 from g3r.errors import InputError
 from g3r.run.hidden_folders import HiddenFolders
+from g3r.run.machine import available_cores
 
 INFER = (sys.executable, "-m", "g3r.cli.infer")
 
 AUTO = "auto"
 """Stands for a mask's file: g3r-infer finds the mask itself."""
+
+THREADS = "--threads"
+"""The option of g3r-infer."""
 
 SPEAKER = "g3r-infer: "
 """Prefix of the lines that the command prints."""
@@ -62,10 +66,29 @@ class Work:
     def is_done(self) -> bool:
         """Whether exactly this command has written its complete result."""
         try:
-            words = json.loads(self.note.read_text(encoding="utf-8"))
-            return words == list(self.words) and not read_object(self.result / RECORD).get("partial", True)
-        except (OSError, ValueError, InputError):
+            return self.last_words() == self.words and not read_object(self.result / RECORD).get("partial", True)
+        except InputError:
             return False
+
+    def last_words(self) -> tuple[str, ...]:
+        """The words of its last run; none if it has not run."""
+        try:
+            words = json.loads(self.note.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return ()
+        return tuple(words) if isinstance(words, list) else ()
+
+    def with_threads(self, n_threads: int, *, as_before: bool) -> Work:
+        """The command with its number of threads.
+
+        Args:
+            n_threads: of its process.
+            as_before: whether an earlier run of the same command decides, if this machine has as many cores; its
+                stages can only be used with as many threads.
+        """
+        choices = [n_threads, *(range(1, available_cores() + 1) if as_before else ())]
+        works = [replace(self, words=(*self.words, THREADS, str(n))) for n in choices]
+        return next((work for work in works if work.words == self.last_words()), works[0])
 
 
 @dataclass(kw_only=True)
@@ -81,6 +104,7 @@ class Cohort:
         force: whether finished sessions are run again.
         mask_derivative: name of the folder in `derivatives/` with the masks; None for any.
         n_threads: threads of each process; None if the options state them.
+        threads_may_vary: whether another run of the same command may get another `n_threads`, by what memory is free.
         keep_work: whether all of g3r-infer's files stay in the work folder.
         command: the command that makes a result.
         say: called with a line for each session that starts or ends.
@@ -94,6 +118,7 @@ class Cohort:
     force: bool = False
     mask_derivative: str | None = None
     n_threads: int | None = 1
+    threads_may_vary: bool = False
     keep_work: bool = False
     command: tuple[str, ...] = field(default_factory=lambda: INFER)
     say: Callable[[str], None] = lambda line: None
@@ -136,18 +161,23 @@ class Cohort:
         """The command of a session.
 
         Raises:
-            InputError: its masks are ambiguous, or a sidecar cannot be read.
+            InputError: it has no stack, its masks are ambiguous, or a sidecar cannot be read.
         """
+        if not session.stacks:
+            raise InputError(
+                f"{session.stem}: none of its T2w files is a stack as it was scanned ({', '.join(session.left_out)}); "
+                f"expected {session.stem}[_acq-*][_run-*]_T2w.nii.gz, rename them"
+            )
         folder = self.out_dir / WORK / session.stem
         masks = [] if self.whole_image else find_masks(session, self.bids_dir, self.out_dir, self.mask_derivative)
         stacks = [self._with_inherited(stack, folder / "stacks") for stack in session.stacks]
         words = [*self.command, "--stacks", *map(str, stacks)]
         words += ["--masks", *(str(mask or AUTO) for mask in masks)] if masks else []
         words += [*self.options, "--output", str(folder / "result"), "--force"]
-        words += ["--threads", str(self.n_threads)] if self.n_threads else []
         words += ["--resume"] if self.resumes and not self.force else []
         inputs = (*session.stacks, *(mask for mask in masks if mask))
-        return Work(session=session, inputs=inputs, words=tuple(words), folder=folder)
+        work = Work(session=session, inputs=inputs, words=tuple(words), folder=folder)
+        return work.with_threads(self.n_threads, as_before=self.threads_may_vary) if self.n_threads else work
 
     def _with_inherited(self, stack: Path, folder: Path) -> Path:
         """The stack; if it inherits sidecar keys, a link to it with a complete sidecar beside it."""

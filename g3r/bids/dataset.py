@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 
 from g3r.bids.description import is_own_derivative
 from g3r.bids.names import BidsName, parsed_name
 from g3r.errors import InputError
+from g3r.run.folder_walk import walked
 
 READ_ENTITIES = {"sub", "ses", "acq", "run"}
 """Entities of a scanned stack. A T2w file with others is a reconstruction (rec), an echo or a phase image."""
@@ -21,7 +23,7 @@ class Session:
     Attributes:
         participant, session: labels; session is None if the data set has none.
         stacks: T2w images of its anat folder, in order of their names.
-        left_out: names of T2w images that are not stacks.
+        left_out: names of T2w images that are not stacks; where there is no other, the session cannot be reconstructed.
     """
 
     participant: str
@@ -69,7 +71,7 @@ def find_sessions(
             if wanted is None or label in wanted:
                 own = _session(visit, participant, label)
                 found += [own] if own else []
-    if not found:
+    if not any(session.stacks for session in found):
         chosen = " for these participants and sessions" if participants or sessions else ""
         raise InputError(f"{bids_dir}: holds no T2w image{chosen}; expected sub-*/[ses-*/]anat/sub-*_T2w.nii.gz")
     return found
@@ -92,7 +94,9 @@ def find_masks(session: Session, bids_dir: Path, out_dir: Path, derivative: str 
     root = bids_dir / "derivatives"
     masks: dict[frozenset[tuple[str, str]], list[Path]] = {}
     for folder in _mask_folders(root, out_dir, derivative):
-        for path in sorted((folder / session.folder).rglob("*_mask.nii*")):
+        for path in (parent / name for parent, names in walked(folder / session.folder) for name in names):
+            if not fnmatch(path.name, "*_mask.nii*"):
+                continue
             name = parsed_name(path)
             if name is not None and _is_brain_mask(name):
                 masks.setdefault(name.scan, []).append(path.relative_to(root))
@@ -153,7 +157,7 @@ def _session(folder: Path, participant: str, session: str | None) -> Session | N
             stacks.append(path)
         else:
             left_out.append(path.name)
-    if not stacks:
+    if not (stacks or left_out):
         return None
     return Session(participant=participant, session=session, stacks=tuple(stacks), left_out=tuple(left_out))
 

@@ -101,11 +101,15 @@ def write_data_set(bids_dir: Path, out_dir: Path, command: str) -> None:
 
 
 def relative_url(bids_dir: Path, out_dir: Path) -> str:
-    """Relative URL from one folder to the other, so that both can be moved together and no folder above is named."""
-    try:
-        return Path(os.path.relpath(bids_dir.resolve(), out_dir.resolve())).as_posix()
-    except ValueError:  # on another drive of Windows
-        return bids_dir.resolve().as_uri()
+    """Relative URL from one folder to the other, so that both can be moved together and no folder above is named.
+
+    Where neither holds the other and they do not lie side by side, it is the name of the data set alone: the way there
+    leads through folders that may be named after a patient.
+    """
+    source, output = bids_dir.resolve(), out_dir.resolve()
+    if source.parent in output.parents or output in source.parents:
+        return Path(os.path.relpath(source, output)).as_posix()
+    return source.name
 
 
 def read_object(path: Path) -> dict[str, Any]:

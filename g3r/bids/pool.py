@@ -52,8 +52,11 @@ class LocalPool:
             while waiting or running:
                 while waiting and len(running) < self.n_jobs:
                     number, job = waiting.pop(0)
-                    begin(number)
-                    running[number] = start(job), time.monotonic()
+                    try:
+                        begin(number)
+                        running[number] = start(job), time.monotonic()
+                    except OSError as error:
+                        ended(number, Ended(lost=f"its process could not be started ({error})"))
                 for number, (process, started_s) in list(running.items()):
                     if process.poll() is not None:
                         del running[number]

@@ -47,9 +47,9 @@ def build_parser() -> argparse.ArgumentParser:
         "130 interrupted",
     )
     parser.add_argument(
-        "bids_dir", type=Path, metavar="BIDS_DIR", help="data set; masks are looked for in derivatives/*"
+        "bids_dir", type=_folder, metavar="BIDS_DIR", help="data set; masks are looked for in derivatives/*"
     )
-    parser.add_argument("out_dir", type=Path, metavar="OUT_DIR", help="derivative data set to write")
+    parser.add_argument("out_dir", type=_folder, metavar="OUT_DIR", help="derivative data set to write")
     parser.add_argument(
         "level",
         choices=("participant", "group"),
@@ -100,6 +100,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(PROG, work, interrupted=lambda: (line, stop_request.exit_code))
 
 
+def _folder(text: str) -> Path:
+    """A folder; absolute where it begins with a dash, which g3r-infer would take for an option."""
+    path = Path(text)
+    return path.absolute() if str(path).startswith("-") else path
+
+
 def _slurm_request(text: str) -> SlurmRequest:
     from g3r.bids.slurm_request import parsed_request
 
@@ -148,6 +154,7 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
         force=options.force,
         mask_derivative=options.mask_derivative,
         n_threads=None if infer.threads else n_threads,
+        threads_may_vary=options.jobs is None and options.slurm is None,
         keep_work=options.keep_work,
         say=lambda line: print(line, flush=True),
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from g3r.dicom.headers import ImageHeader
 from g3r.dicom.series import SAME_PLACE_MM, UNEVEN_FROM, Series
 from g3r.errors import InputError
 
@@ -143,7 +144,8 @@ def _without_repeats(verdicts: list[Judged]) -> list[Judged]:
     found = []
     for one in verdicts:
         other = kept[_acquisition(one.series)] if one.is_taken else one.series
-        if other is one.series:
+        # copies have other image types; stacks of the same type are others, whose times were removed
+        if other is one.series or other.first.image_type == one.series.first.image_type:
             found.append(one)
         else:
             reason = f"same acquisition as series {other.label}"
@@ -155,8 +157,11 @@ def _acquisition(series: Series) -> tuple[object, ...]:
     """A key that only copies of one acquisition share; the UID of the series if its headers have no times."""
     if not all(image.acquired_at for image in series.images):
         return (series.first.series_uid,)
-    places_mm = np.round(np.concatenate([[0.0], np.cumsum(series.steps_mm)]), 1)
-    return tuple(
-        (image.acquired_on, image.acquired_at, place)
-        for image, place in zip(series.by_place, places_mm.tolist(), strict=True)
-    )
+    return tuple((image.acquired_on, image.acquired_at, *_plane(image)) for image in series.by_place)
+
+
+def _plane(image: ImageHeader) -> tuple[float, ...]:
+    """Position and axes of an image that has them, rounded."""
+    assert image.position_mm is not None
+    assert image.axes is not None
+    return (*np.round(image.position_mm, 1).tolist(), *np.round(image.axes, 3).ravel().tolist())

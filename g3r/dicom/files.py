@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
+from g3r.run.folder_walk import walked
+
 PREAMBLE_BYTES, MAGIC = 128, b"DICM"
 """A DICOM file has these magic bytes after a preamble of this length."""
 
@@ -37,9 +39,8 @@ def dicom_files(folder: str | os.PathLike[str], unreadable: list[OSError]) -> It
         folder: folder to search.
         unreadable: gets the error of each file and folder that cannot be read.
     """
-    for parent, folders, names in os.walk(folder, onerror=unreadable.append):
-        folders.sort()
-        for path in (Path(parent, name) for name in sorted(names)):
+    for parent, names in walked(folder, unreadable.append):
+        for path in (parent / name for name in names):
             try:
                 found = _begins_as_dicom(path)
             except OSError as error:
@@ -51,5 +52,5 @@ def dicom_files(folder: str | os.PathLike[str], unreadable: list[OSError]) -> It
 
 def holds_dicom(folder: str | os.PathLike[str]) -> bool:
     """Whether there is DICOM among the first `LOOKED_AT` files below a folder, which may be a whole disk."""
-    paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
+    paths = (parent / name for parent, names in walked(folder) for name in names)
     return any(map(is_dicom, islice(paths, LOOKED_AT)))

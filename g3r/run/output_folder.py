@@ -11,6 +11,7 @@ the folder that the process works in, whose shell would be left in a removed one
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sys
@@ -19,7 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from g3r.errors import InputError, cannot_be_written
 from g3r.run.atomic_file import sync
@@ -28,6 +29,9 @@ SUFFIX = ".unfinished"
 
 FOUND_ON_DISKS = {SUFFIX, "lost+found"}
 """Names that an empty file system may hold."""
+
+NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}
+"""Errors of file systems without locks; there a file that names its process stands for the lock."""
 
 LAST_NAME = "run.json"
 """Moved last where files move one by one, so that a result that has it is complete."""
@@ -58,7 +62,7 @@ class OutputFolder:
         self.is_written = False
         self._new, self._backup = self.staging / "new", self.staging / "backup"
         self._half_backup, self._replaced = self.staging / "half-backup", self.staging / "replaced"
-        self._lock: FileLock | None = None
+        self._lock: BaseFileLock | None = None
         self._made: list[Path] = []
 
     def __enter__(self) -> OutputFolder:
@@ -157,11 +161,17 @@ class OutputFolder:
         path, process = self.staging / "lock", self.staging / "process"
         while self._lock is None:
             self.staging.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(path, timeout=0)
+            lock: BaseFileLock = FileLock(path, timeout=0)
             try:
-                lock.acquire()
+                try:
+                    lock.acquire()
+                except OSError as error:
+                    if error.errno not in NO_LOCKS:
+                        raise
+                    lock = SoftFileLock(path.with_name("lock-by-name"), timeout=0)
+                    lock.acquire()
             except Timeout:
-                if not path.exists():  # its run ended and removed the folder in between
+                if not Path(lock.lock_file).exists():  # its run ended and removed the folder in between
                     continue
                 number = "unknown"
                 with suppress(OSError):
@@ -170,7 +180,7 @@ class OutputFolder:
                     f"{self.named}: another run is writing it (process {number}); wait for it, or "
                     "choose another --output"
                 ) from None
-            if path.exists():
+            if Path(lock.lock_file).exists():
                 self._lock = lock
                 with suppress(OSError):  # a full disk: then the process is not named
                     process.write_text(str(os.getpid()), encoding="ascii")

@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from g3r.bids import cohort
+from g3r.bids.dataset import Session
 from g3r.cli.bids import main
 from tests.bids.cohorts import rows, volumes
 from tests.bids.data_sets import BROKEN, add_session, ready_result, stand_in
@@ -241,3 +242,35 @@ def test_neither_command_lines_nor_reasons_name_folders(raw: Path, use: Use, tmp
     told += [path.read_text().splitlines()[0] for path in logs]
     assert len(told) == N + 4
     assert not any("JANE" in text or str(tmp_path) in text for text in told)
+
+
+def test_an_interrupted_session_keeps_its_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its stages can only be used with as many, and how many there are follows the memory that is free."""
+    monkeypatch.setattr(cohort, "available_cores", lambda: 4)
+    session = Session(participant="01", session=None, stacks=())
+    work = cohort.Work(session=session, inputs=(), words=("infer", "--resume"), folder=tmp_path)
+    assert work.with_threads(2, as_before=True).words[-2:] == ("--threads", "2")
+    work.note.write_text(json.dumps([*work.words, "--threads", "4"]))
+    assert work.with_threads(2, as_before=True).words[-1] == "4"
+    assert work.with_threads(2, as_before=False).words[-1] == "2"
+    monkeypatch.setattr(cohort, "available_cores", lambda: 3)
+    assert work.with_threads(2, as_before=True).words[-1] == "2"
+    monkeypatch.setattr(cohort, "available_cores", lambda: 4)
+    other = cohort.Work(session=session, inputs=(), words=("infer", "--preset", "fast"), folder=tmp_path)
+    assert other.with_threads(2, as_before=True).words[-1] == "2"
+
+
+def test_a_session_without_a_stack_fails_alone(
+    raw: Path, use: Use, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use()
+    (raw / "sub-04").rename(tmp_path / "sub-04")
+    anat = add_session(raw, "07", None, [("rec-other", b"x", None)])
+    assert anat.is_dir()
+    monkeypatch.chdir(tmp_path)
+    raw.rename(tmp_path / "-raw")
+    assert main(["./-raw", "out", "participant"]) == 1
+    assert rows(tmp_path / "out")["sub-07"]["reasons"].startswith("sub-07: none of its T2w files is a stack")
+    assert len(volumes(tmp_path / "out")) == N - 1
+    words = events(tmp_path)[0]["words"]
+    assert Path(words[words.index("--stacks") + 1]).is_absolute()

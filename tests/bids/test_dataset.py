@@ -121,3 +121,24 @@ def test_refusals(tmp_path: Path) -> None:
         find_sessions(tmp_path, ["02"], ["1"])
     with pytest.raises(InputError, match="no T2w image for these"):
         find_sessions(tmp_path, None, ["3"])
+
+
+def test_a_session_without_a_stack_is_not_forgotten(tmp_path: Path) -> None:
+    add_session(tmp_path, "01", None, STACKS)
+    anat = add_session(tmp_path, "02", "a", [("run-1", b"x", None)])
+    (anat / "sub-02_ses-a_run-1_T2w.nii.gz").rename(anat / "sub-02_run-1_T2w.nii.gz")
+    found = find_sessions(tmp_path)
+    assert [(one.stem, len(one.stacks), one.left_out) for one in found] == [
+        ("sub-01", 2, ()), ("sub-02_ses-a", 0, ("sub-02_run-1_T2w.nii.gz",))
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="holds no T2w image for these participants"):
+        find_sessions(tmp_path, ["02"])
+
+
+def test_masks_behind_a_link_are_found(tmp_path: Path) -> None:
+    add_session(tmp_path / "raw", "01", None, STACKS)
+    anat = tmp_path / "raw" / "derivatives" / "masks" / "sub-01" / "anat"
+    anat.rename(tmp_path / "elsewhere")
+    anat.symlink_to(tmp_path / "elsewhere")
+    (session,) = find_sessions(tmp_path / "raw")
+    assert None not in find_masks(session, tmp_path / "raw", tmp_path / "out")

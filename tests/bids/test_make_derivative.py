@@ -11,6 +11,7 @@ import pytest
 
 from g3r.bids.dataset import Session, find_sessions
 from g3r.bids.derivative import make_derivative, record_path
+from g3r.bids.description import relative_url
 from tests.bids.data_sets import add_session, ready_result
 
 STACKS = [("run-1", b"x", b"m"), ("run-2", b"x", None)]
@@ -77,3 +78,16 @@ def test_killed_between_two_renames(session: Session, result: Path, tmp_path: Pa
     staging.mkdir(parents=True)
     anat.rename(staging / "earlier-anat")
     assert (make(session, result, tmp_path) / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("source", "output", "url"),
+    [
+        ("study/raw", "study/raw/derivatives/g3r", "../.."),
+        ("study/raw", "study/g3r", "../raw"),
+        ("study/raw", "study/derivatives/g3r", "../../raw"),
+        ("clinic/Doe_Jane/raw", "scratch/g3r", "raw"),
+    ],
+)
+def test_the_link_names_no_folder_on_the_way(tmp_path: Path, source: str, output: str, url: str) -> None:
+    assert relative_url(tmp_path / source, tmp_path / output) == url

@@ -105,3 +105,13 @@ def test_jobs_by_cores_and_memory(monkeypatch: pytest.MonkeyPatch, cores: int, f
     assert pool.threads_each(jobs) == max(1, cores // jobs)
     monkeypatch.setitem(os.environ, "NUMBA_NUM_THREADS", "1")
     assert pool.threads_each(jobs) == 1
+
+
+def test_a_process_that_cannot_start_stops_no_other(tmp_path: Path) -> None:
+    jobs = [sleeper(tmp_path, 0), sleeper(tmp_path, 0)]
+    jobs[0].log.mkdir()
+    ends: dict[int, Ended] = {}
+    LocalPool(1).run_all(jobs, lambda number: None, ends.__setitem__)
+    assert ends[0].code is None
+    assert "could not be started" in ends[0].lost
+    assert ends[1].code == 0

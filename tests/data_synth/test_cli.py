@@ -92,8 +92,13 @@ def test_a_phantom_and_what_is_already_there(tmp_path: Path) -> None:
     assert "--force" in refused.stderr
     assert (output / "stack-0.nii.gz").read_bytes() == before
 
+    (output / "out").mkdir()
+    (output / "out" / "volume.nii.gz").write_bytes(b"a reconstruction")
+    (output / "stack-7.nii.gz").write_bytes(b"of an earlier simulation with more stacks")
     assert run(*arguments, "--seed", 1, "--force").returncode == 0
     assert (output / "stack-0.nii.gz").read_bytes() != before
+    assert (output / "out" / "volume.nii.gz").read_bytes() == b"a reconstruction"
+    assert not (output / "stack-7.nii.gz").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["case"]
 
 

@@ -95,6 +95,14 @@ def test_an_acquisition_that_is_stored_twice_counts_once(tmp_path: Path) -> None
     assert found["2"].reason == "same acquisition as series 3"
 
 
+def test_stacks_whose_times_were_removed_are_no_copies(tmp_path: Path) -> None:
+    study = Study(tmp_path)
+    data, affine = block()
+    for number, axes in ((2, [0, 1, 2, 3]), (3, [1, 2, 0, 3]), (4, [0, 1, 2, 3])):
+        study.write(data, affine[:, axes], number, AcquisitionTime="000000")
+    assert [one.is_taken for one in verdicts(tmp_path).values()] == [True, True, True]
+
+
 def test_two_series_of_one_number_have_letters(tmp_path: Path) -> None:
     study = Study(tmp_path)
     for time in ("090000", "080000"):
