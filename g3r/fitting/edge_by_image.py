@@ -31,16 +31,16 @@ voxel, where the edge lies, would be best on the whole grid; but a voxel of the 
 
 SETTINGS = VoxelProblemSettings(hold=0.003, total_variation=0.13, tip=0.05, n_rounds=3, n_iterations=10)
 
-FULL_MM = 1.5
+FULL_MM = 1.1
 """Deeper inside the support than this, the volume is shown in full: what is dark there is fluid."""
 
 CONTINUED_MM = 1.5
 """Standard deviation of the Gaussian mean that continues the volume beyond its edge."""
 
-OUTSIDE_MM, INSIDE_MM = 5.0, 6.0
+OUTSIDE_MM, INSIDE_MM = 4.6, 5.6
 """Distances from the edge, outside and inside, up to which pixels are used."""
 
-BESIDE_MM = (3.0, 10.0)
+BESIDE_MM = (2.6, 9.6)
 """Distances from the edge: pixels between the two outside show whether anything lies beside the brain, and pixels
 deeper inside than the first show the brain."""
 
@@ -91,13 +91,18 @@ def shown_by_image(
     share = VoxelProblem(asked, grid, SETTINGS).solved(edge.astype(np.float32))
     low, high = SHARES
     shown = np.clip((share - low) / (high - low), 0, 1)
-    return np.where(depth_mm > FULL_MM, 1, shown).astype(np.float32)
+    outermost_mm = 0.5 * float(grid.spacing_mm.max())
+    return np.where(depth_mm > max(FULL_MM, outermost_mm), 1, shown).astype(np.float32)
 
 
 def _depth_mm(support: NDArray[np.bool_], grid: VolumeGrid) -> Float32Array:
-    """Distance [I, J, K] from the edge of the support, positive inside."""
+    """Distance [I, J, K] from the edge of the support, positive inside.
+
+    What is measured is the way to the next voxel of the other side; the edge lies half a voxel before its middle.
+    """
+    half_mm = 0.5 * float(grid.spacing_mm.min())
     inside, outside = (distance_transform_edt(part, sampling=grid.spacing_mm) for part in (support, ~support))
-    return (inside - outside).astype(np.float32)
+    return np.where(support, inside - half_mm, half_mm - outside).astype(np.float32)
 
 
 def _around(fit: SliceFit, acquired: Slices, depth_mm: Float32Array, grid: VolumeGrid) -> FitPixels | None:
@@ -127,4 +132,4 @@ def _continued(
     width = CONTINUED_MM / grid.spacing_mm
     weight = gaussian_filter(counts * counts, width)
     around = np.divide(gaussian_filter(volume * counts, width), weight, out=np.zeros_like(volume), where=weight > 1e-3)
-    return np.where(depth_mm > float(grid.spacing_mm.min()), volume, around).astype(np.float32)
+    return np.where(depth_mm > 0.5 * float(grid.spacing_mm.max()), volume, around).astype(np.float32)

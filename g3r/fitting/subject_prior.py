@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was not tried
     None: "slices of the single stack stay where the atlas template or the header has them",
     True: "slices of the single stack were registered to the prior volume",
-    False: "slices of the single stack stay in line at first: the prior gave no reason to move",
+    False: "slices of the single stack stay where they were at first: the prior gave no reason to move",
 }
 
 

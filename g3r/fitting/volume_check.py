@@ -1,4 +1,4 @@
-"""Check that a finished volume explains the slices at least as well as the volumes that it was made from."""
+"""Check that a volume, before its correction on voxels, explains the slices as well as those that it was made from."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class VolumeCheck:
     """How well volumes explain the slices of a subject.
 
     Attributes:
-        volume, prior, coarse: root mean square error of the masked pixels that the finished volume, V_prior and
-            V_coarse predict, each with gains and bias fields of its own, as a share of the root mean square of the
+        volume, prior, coarse: root mean square error of the masked pixels that the mixture, V_prior and V_coarse
+            predict, each with gains and bias fields of its own, as a share of the root mean square of the
             pixels.
     """
 
@@ -43,7 +43,7 @@ class VolumeCheck:
 
     @property
     def falls_back(self) -> bool:
-        """Whether V_prior is to be written in place of the finished volume."""
+        """Whether V_prior is to be written in place of the mixture."""
         return self.prior < (1 - EQUAL) * self.volume
 
     def line(self) -> str:
@@ -55,7 +55,7 @@ class VolumeCheck:
             )
         if self.coarse < (1 - EQUAL) * self.volume:
             return (
-                f"the mean of the slices explains them better (residual {self.coarse:.3f}) than the volume does "
+                f"the mean of the slices explains them better (residual {self.coarse:.3f}) than the fit does "
                 f"({self.volume:.3f}); look at the registration"
             )
         return ""
@@ -72,7 +72,7 @@ def check_volume(
     slices_before: Slices,
     weight: NDArray[np.float64],
 ) -> VolumeCheck:
-    """Compare the finished volume with the volumes that it started from, by slices that all of them have seen.
+    """Compare the mixture with the volumes that it started from, by slices that all of them have seen.
 
     Slices held out of the fit alone would not be fair to the fit: V_prior and V_coarse have seen them.
 
@@ -101,7 +101,7 @@ def _residuals(
     """Weighted errors after a gain for each slice and a bias field for each stack, relative to the intensities.
 
     Slices show the bias fields of their stacks. V_coarse and V_prior are means over the stacks and still contain the
-    part that stacks share; the finished volume does not. Without fields fitted to each volume, the one that is freest
+    part that stacks share; the mixture does not. Without fields fitted to each volume, the one that is freest
     of them would explain least.
 
     Args:

@@ -2,9 +2,9 @@
 
     minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s |grad V| ]_v
 
-V_0 is the mixture of Gaussians and V_prior, A the voxel operator with the profiles of the fit, y the pixels without
-gains and fields, r the mean coverage of a voxel. Gaussians lie further apart than voxels, so an edge between two of
-them comes out too soft. The correction D = V - V_0 sharpens it as far as the slices require it against h and s.
+V_0 is the mixture of Gaussians and V_prior, A the voxel operator (`fitting.voxel_problem`), y the pixels without gains
+and fields, r the mean coverage of a voxel. Gaussians lie further apart than voxels, so an edge between two of them comes
+out too soft. The correction D = V - V_0 sharpens it as far as the slices require it against h and s.
 
 How well V_0 shows a head differs: h is low where generalised cross-validation finds that V_0 is in the way. Total
 variation then has to tell detail from noise alone, so its edges are found in more rounds, and it is sharper.
@@ -22,15 +22,18 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.voxel_problem import FitPixels, Float32Array, VoxelProblem, VoxelProblemSettings
 from g3r.geometry import VolumeGrid
 
+PROBE_SIZE = np.float32(0.03)
+"""Standard deviation of the random change that measures how much of V_0 stays, in normalised intensities."""
+
 PROBE_SIGMA_MM, KEPT_SIGMA_MM = 0.4, 3.2
-"""Width of the random change that measures how much of V_0 stays, and of the neighbourhoods in which responses are
+"""Width of that change, and of the neighbourhoods in which responses are
 compared (as in `uncertainty.prior_share`). Of wider changes less stays; of this one about as much as of V_prior - V_G
 (V_G: the Gaussians alone), or a little less: 0.51 and 0.63 of 0.53 and 0.69 in a simulated and a real subject."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelCorrectionSettings(VoxelProblemSettings):
-    """Settings of the correction; intensities are normalised.
+    """Settings of the correction of a single fit; intensities are normalised.
 
     Args:
         loosens: whether `LOOSE` is used instead where cross-validation prefers less hold. Only from three stacks on,
@@ -44,6 +47,11 @@ class VoxelCorrectionSettings(VoxelProblemSettings):
     n_iterations: int = 8
     loosens: bool = True
 
+    def for_mean(self) -> VoxelCorrectionSettings:
+        """The settings for the mean of several fits."""
+        hold, strength = MEAN_HOLD * self.hold, MEAN_TOTAL_VARIATION * self.total_variation
+        return replace(self, hold=hold, total_variation=strength)
+
 
 TIGHT = VoxelCorrectionSettings()
 LESS_HELD = replace(TIGHT, hold=0.15)
@@ -53,6 +61,9 @@ less in all heads, and it hardly tells against the mean of several fits, whose f
 LOOSE = replace(TIGHT, hold=0.06, total_variation=0.011, tip=0.005, n_rounds=4)
 """Used where less hold is better. On four phantoms, each in moderate and in mild motion, it has 0.01 to 0.20 dB more
 than `LESS_HELD`, and 0.70 to 0.75 of its LPIPS."""
+
+MEAN_HOLD, MEAN_TOTAL_VARIATION = 2.5, 2.0
+"""Factors of hold and total variation for a mean of several fits, which leaves less to correct than one fit."""
 
 CLEARLY = 0.997
 """`LOOSE` is taken if `LESS_HELD` has at most this share of the error of `TIGHT`. Phantoms, which gain, have 0.988 to
@@ -125,13 +136,15 @@ def correct_on_voxels(
         noise = whole.noise(volume, grid)
         if settings.loosens and fit.slices.n_stacks >= ENOUGH_STACKS:
             loose_error, tight = _compared(whole, grid, of_one_fit, noise, rng)
-    asked = settings if loose_error is None or loose_error > CLEARLY else LOOSE
+    asked = settings if of_one_fit is volume else settings.for_mean()
+    if loose_error is not None and loose_error <= CLEARLY:
+        asked = LOOSE
     problem = VoxelProblem(whole, grid, asked.for_noise(noise))
-    found = tight if tight is not None and asked == TIGHT and of_one_fit is volume else problem.solved(volume)
+    found = tight if tight is not None and asked == TIGHT else problem.solved(volume)
     values = ((found - volume) * reach).astype(np.float16)
     inside = reach > 0
     size = float(np.sqrt((values[inside].astype(np.float64) ** 2).mean())) if inside.any() else 0.0
-    kept = 1 - reach * (1 - _kept(problem, found, rng))
+    kept = 1 - reach * (1 - _kept(problem, volume, found, rng))
     record = VoxelCorrectionRecord(
         hold=round(problem.settings.hold, 3),
         loose_error=None if loose_error is None else round(loose_error, 4),
@@ -153,12 +166,12 @@ def _compared(
     return errors[0] / max(errors[1], 1e-30), found
 
 
-def _kept(problem: VoxelProblem, found: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """Share [I, J, K] of a small change of V_0 that stays in V, with the edges of V."""
+def _kept(problem: VoxelProblem, volume: Float32Array, found: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """Share [I, J, K] of a small change of V_0 that stays in V, edges that follow the change included."""
     grid = problem.grid
     change = gaussian_filter(rng.standard_normal(grid.shape), PROBE_SIGMA_MM / grid.spacing_mm)
     change = (change / change.std()).astype(np.float32)
-    left = problem.solve(problem.hold * change, change, problem.edges(found))
+    left = (problem.solved(volume + PROBE_SIZE * change) - found) / PROBE_SIZE
     width = KEPT_SIGMA_MM / grid.spacing_mm
     together, own = (gaussian_filter(one * change, width) for one in (left, change))
     return np.clip(together / np.maximum(own, 1e-6), 0, 1).astype(np.float32)

@@ -56,6 +56,7 @@ def estimate_maps(
         reliable: whether the registration is reliable; None if unknown.
     """
     prior_share = None
+    shown = written.mask if settings.fill_unseen else written.mask & ~written.unseen
     if settings.use_prior:
         with run.timed(Stage.PRIOR_SHARE):
             prior_share = _mixed_share(written, fit, found, settings)
@@ -64,7 +65,7 @@ def estimate_maps(
         estimated = estimate_uncertainty(
             UncertaintyInputs(
                 volume=written.mixed,  # errors are calibrated on it; the correction lowers them a little
-                mask=written.mask,
+                mask=shown,
                 grid=written.grid,
                 fit=fit,
                 prior=found.prior.values,
@@ -81,7 +82,7 @@ def estimate_maps(
     if written.correction is not None and prior_share is not None:
         kept = on_grid(written.correction.kept, found.prior.volumes.grid, written.grid, outside=1.0)
         prior_share = np.where(written.unseen, 1, prior_share * kept)
-        record = record | {"prior_share": prior_share_summary(prior_share[written.mask])}
+        record = record | {"prior_share": prior_share_summary(prior_share[shown])}
     return VolumeMaps(uncertainty=estimated.expected_error, prior_share=prior_share, record=record)
 
 

@@ -286,10 +286,11 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[Ina
     if not settings.common_bias_field:
         found.append(InactiveTerm("common bias field", "switched off in the settings"))
     if not stage.optimise_poses:
-        reason = "a single stack without a prior to hold it drifts" if single else "switched off in the settings"
+        drifts = single and not (settings.use_prior and settings.distillation)
+        reason = "a single stack without a prior to hold it drifts" if drifts else "switched off in the settings"
         found.append(InactiveTerm("poses in the fit", reason))
     if not settings.use_prior:
-        found.append(InactiveTerm("distance to the prior", "no prior was asked for"))
+        found.append(InactiveTerm("distance to the prior", "no prior is in use"))
     elif not settings.distillation:
         reason = (
             "distillation is switched off in the settings"

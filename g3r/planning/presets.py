@@ -153,8 +153,6 @@ PRESETS: dict[str, ReconstructionSettings] = {
         held_out=HeldOutSettings(slab=0.4, n_steps=25),
         prior_views=8,
         share_probes=2,
-        # the mean of lattices leaves less to correct
-        voxel_correction=VoxelCorrectionSettings(hold=1.5, total_variation=0.03),
     ),
 }
 """Settings by name, from quick to careful."""

@@ -29,12 +29,13 @@ def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) 
     Returns:
         The median over the slices of the other stacks, at the place of that stack, and None for the others: without a
         sound stack the rest gain, too, as long as an intruder stays. None for fewer than three stacks, where those left
-        have nothing to agree with, and where the slices of every stack fit as those of stacks in place do.
+        have nothing to agree with, and where the slices of any stack fit as those of stacks in place do: they would not
+        fit a mean of two heads.
     """
     slices: Slices = fitted.slices
     stacks = np.unique(slices.stack_id).tolist()
     fit = [float(np.median(fitted.ncc[slices.stack_id == stack])) for stack in stacks]
-    if len(stacks) < 3 or min(fit) >= IN_PLACE_NCC:
+    if len(stacks) < 3 or max(fit) >= IN_PLACE_NCC:
         return None
     found = []
     for stack in stacks:

@@ -18,6 +18,7 @@ from g3r.errors import InputError, cannot_be_written
 from g3r.output.files import FULL_WEIGHT, REPORT_NAME
 from g3r.output.map_colours import INFERNO
 from g3r.output.record import RunRecord
+from g3r.planning.anatomy import NAME_OF
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MIN_HELD_OUT, RETRY_BELOW_CORRELATION
 from g3r.report.motion_chart import motion_chart
 from g3r.report.pictures import central_sections
@@ -82,6 +83,7 @@ def report_html(folder: Path, slices: Slices | None = None) -> str:
             images.data["volume"], images.grid.index(images.mask_center_mm), *images.window["volume"]
         ),
         unseen=_unseen_line(record),
+        rests_on_others=_rests_on_others(record),
         charts=_charts(record, rows, images),
         pictures=pictures,
         rows=[_row_of(record, rows, k) for k in worst_first(rows).tolist() if rows.weight[k] < FULL_WEIGHT],
@@ -163,8 +165,18 @@ def _unseen_line(record: RunRecord) -> str:
     line = record.unseen.line() if record.unseen else None
     if line:
         return line[0].upper() + line[1:] + "."
-    share = record.unseen.share if record.unseen else 0.0
-    return f"Slices saw the whole brain ({100 * share:.1f} % lies between them)." if record.unseen else "Not measured."
+    if record.unseen is None:
+        return "Not measured."
+    what = NAME_OF[record.settings.anatomy]
+    return f"Slices saw the whole {what} ({100 * record.unseen.share:.1f} % lies between them)."
+
+
+def _rests_on_others(record: RunRecord) -> float | None:
+    """Mean prior share of the brain; 0 without a prior, None where it was not estimated."""
+    if not record.settings.use_prior:
+        return 0.0
+    share = (record.uncertainty or {}).get("prior_share")
+    return float(share["mean_in_mask"]) if share else None
 
 
 def _plain_settings(record: RunRecord) -> dict[str, Any]:

@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from g3r.fitting.prior_weight import ended_early
 from g3r.output.record import LOSS_ROSE
 from g3r.planning.anatomy import NAME_OF
+from g3r.planning.stages import Stage
 from g3r.registration.quality import JUDGED, PARALLEL, misfit, nearly_parallel
 from g3r.registration.stack_quality import is_mirrored, rounded_down, shortfalls, unlike_others
 from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
@@ -114,13 +116,24 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
         yield "not fitted" if record.time_budget else "preview", {"what": kind}
     elif record.prior_weight == 1 and not (record.volume_check and record.volume_check.falls_back):
         yield "fit ended early", {}
+    elif not record.settings.use_prior and _hardly_begun(record):
+        yield "fit hardly begun", {"steps": _n_steps(record)}
     search = record.settings.registration
-    if record.settings.n_lattices and search.template and not search.check_handedness and len(record.stacks) > 1:
+    looked_for_sides = search.check_handedness or not (search.template or record.time_budget)
+    if record.settings.n_lattices and not looked_for_sides and len(record.stacks) > 1:
         yield "sides not compared", {}
     said = {unseen, checked}
     for line in record.warnings:
         if line not in said and not _is_said_otherwise(line, record):
             yield "warning", {"line": line}
+
+
+def _n_steps(record: RunRecord) -> int:
+    return len(record.loss.get(Stage.FIT_TO_SLICES, []))
+
+
+def _hardly_begun(record: RunRecord) -> bool:
+    return ended_early(_n_steps(record), record.settings.slice_stage.n_steps)
 
 
 def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:

@@ -138,6 +138,11 @@ MESSAGES = {
         "the fit had too little time to be shown: this is the prior volume alone",
         "Run again with a longer --time-budget, or without one, before reading it.",
     ),
+    "fit hardly begun": Message(
+        CHECK,
+        "the fit had too little time: it ended after {steps} steps",
+        "Run again with a longer --time-budget, or without one, before reading it.",
+    ),
     "sides not compared": Message(
         CHECK,
         "there was no time to ask whether a stack is a mirror image of the others, or does not belong to them",

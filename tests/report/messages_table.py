@@ -21,6 +21,7 @@ FILLED_IN = {
     "n": "N",
     "all": "N",
     "where": "interrupted",
+    "steps": "N",
     "share": "N %",
     "ncc": "N",
     "best": "N",

@@ -10,8 +10,10 @@ import pytest
 from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.assemble import rollback_warnings
 from g3r.output.record import RunRecord
+from g3r.planning.anatomy import GENERIC
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import PRESETS
+from g3r.planning.stages import Stage
 from g3r.registration.quality import (
     FAILED,
     JUDGED,
@@ -55,6 +57,15 @@ def oriented(best: float, rival: float) -> RunRecord:
         orientation_doubtful=True,
     )
     return replace(found, registration=registration)
+
+
+def generic(*, n_steps: int, registration: Any = None, **facts: Any) -> RunRecord:
+    """Three good stacks of another organ, fitted in a number of steps."""
+    asked = PRESETS["fast"]
+    found = registration or asked.registration
+    search = replace(found, template=False, network=False)
+    settings = replace(asked, use_prior=False, anatomy=GENERIC, registration=search)
+    return replace(record(), settings=settings, loss={Stage.FIT_TO_SLICES: [{"image": 0.1}] * n_steps}, **facts)
 
 
 def crossing(angle_deg: float) -> RunRecord:
@@ -160,6 +171,12 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         hurried(n_stacks=3),
         CHECK,
         "there was no time to ask whether a stack is a mirror image of the others, or does not belong",
+    ),
+    "hardly begun": (generic(n_steps=2), CHECK, "the fit had too little time: it ended after 2 steps"),
+    "sides of an object": (
+        generic(n_steps=100, registration=PRESETS["preview"].registration, time_budget=BudgetRecord(seconds=12.0)),
+        CHECK,
+        "there was no time to ask whether a stack is a mirror image of the others",
     ),
     "left out": (record(warnings=["d.nii: left out, no head was found"]), CHECK, "d.nii: left out"),
 }
