@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "networks": "geometry run acquisition checkpoints prior pose_network fitting planning",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians registration output",
-    "report": "geometry run acquisition registration planning output reuse",
+    "report": "geometry run acquisition registration fitting planning output reuse",
     "bids": "geometry run acquisition report",
     "reconstruct": "run acquisition checkpoints registration fitting planning networks output report",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",

@@ -3,8 +3,8 @@
     minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s |grad V| ]_v
 
 V_0 is the mixture of Gaussians and V_prior, A the voxel operator (`fitting.voxel_problem`), y the pixels without gains
-and fields, r the mean coverage of a voxel. Gaussians lie further apart than voxels, so an edge between two of them comes
-out too soft. The correction D = V - V_0 sharpens it as far as the slices require it against h and s.
+and fields, r the mean coverage of a voxel. Gaussians lie further apart than voxels, so an edge between two of them is
+too soft. The correction D = V - V_0 sharpens it as far as the slices require it against h and s.
 
 How well V_0 shows a head differs: h is low where generalised cross-validation finds that V_0 is in the way. Total
 variation then has to tell detail from noise alone, so its edges are found in more rounds, and it is sharper.

@@ -2,8 +2,8 @@
 
     minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s (|grad V| + q |grad V|^2) ]_v
 
-A is the voxel operator with the profiles of the fit through the plane, r the mean coverage of a voxel. In plane it reads
-voxels trilinearly, which blurs about as much as the profile does there. Total variation is solved as a
+A is the voxel operator with the profiles of the fit through the plane; in plane it reads voxels trilinearly, which
+blurs about as much as the profile does there. r is the mean coverage of a voxel. Total variation is solved as a
 sequence of weighted squares (lagged diffusivity, Vogel and Oman 1996).
 """
 

@@ -292,10 +292,7 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[Ina
     if not settings.use_prior:
         found.append(InactiveTerm("distance to the prior", "no prior is in use"))
     elif not settings.distillation:
-        reason = (
-            "distillation is switched off in the settings"
-            if single
-            else "several stacks are nearer to the truth without it"
-        )
+        off, worse = "switched off in the settings", "several stacks are nearer to the truth without it"
+        reason = off if single else worse
         found.append(InactiveTerm("distance to the prior", reason))
     return found
