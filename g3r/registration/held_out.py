@@ -14,6 +14,7 @@ from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.motion_segments import changes_in_time, estimate_interleave, transition_penalty
@@ -45,7 +46,7 @@ THIN_VARIANCE = 1 / 6
 between voxels blurs as much."""
 
 PIXELS_OF_VOLUME = 100_000
-"""A volume of the search is made of at most about this many pixels."""
+"""A volume of the search is made of at most this many pixels."""
 
 
 def volume_without(
@@ -89,7 +90,7 @@ def _of_others(
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
     if fill is not None:
         grid = grid_with_head(grid, fill)
-    index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // n_pixels))
+    index = thinned(others.planes.n_pixels, n_pixels)
     is_thin = float(others.planes.psf_var_mm2[:, 2].max()) < THIN_VARIANCE * spacing_mm**2
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 1 if is_thin else 3))
     value = np.where(others.mask[index], others.value[index], 0).astype(np.float32)
@@ -226,7 +227,7 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     for stack in np.unique(slices.stack_id):
         volume, share, grid = fine_volume_without(evened, stack)
         own = evened.take(evened.stack_id == stack)
-        index = own.pixel_index[:: max(1, len(own.pixel_index) // FINE_PIXELS_OF_VOLUME)]
+        index = own.pixel_index[thinned(len(own.pixel_index), FINE_PIXELS_OF_VOLUME)]
         sampling = VoxelOperator(own.planes, grid, index, (1, 1, 5))
         seen = sampling.forward(share) > 0.5
         predicted, given = sampling.forward(volume)[seen], own.value[index[seen]]

@@ -18,6 +18,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import DARK, DROPPED_WEIGHT
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.motion_segments import cheapest_path, estimate_interleave, time_orders, transition_penalties
@@ -190,7 +191,7 @@ def _volume_of_others(
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
     """A volume of slices that fit, zero outside the masks, and its grid."""
     grid = grid_around(slices, VOXEL_MM, margin_mm=20.0)
-    index = np.arange(0, slices.planes.n_pixels, max(1, slices.planes.n_pixels // PIXELS_OF_VOLUME))
+    index = thinned(slices.planes.n_pixels, PIXELS_OF_VOLUME)
     operator = VoxelOperator(slices.planes, grid, index, (1, 1, 3))
     value = np.where(slices.mask[index], slices.value[index], 0) / gain[operator.plane]
     counts = np.where(weight < DROPPED_WEIGHT, 0.0, weight)[operator.plane]
