@@ -28,7 +28,8 @@ MIN_CUT_SHARE = 0.05
 `MIN_CUT_AREA`, too; then next to nothing lies beyond it."""
 
 MIN_SLICES = 6
-"""Stacks of fewer slices are too coarse to tell where they were cut."""
+"""Fewest acquired slices of a long stack. Whether the field of view cut the head cannot be told from fewer: such stacks
+are neither cut nor whole."""
 
 LENGTH_RATIO, LENGTH_SPREAD = 1.0, 0.2
 """Usual length of a head along the normal over the diameter of a disc of its largest area, and the standard deviation
@@ -63,7 +64,8 @@ class AreaProfile:
         center_mm: [N, 3] middle of that area by the header.
         seen: [N] whether the slice was acquired.
         spacing_mm: slice spacing.
-        cut: whether the field of view cut the head before the first and after the last acquired slice.
+        cut: whether the field of view is known to have cut the head before the first and after the last acquired slice;
+            never known of a stack of fewer than `MIN_SLICES`, which may be a fragment.
     """
 
     index: NDArray[np.int64]
@@ -85,8 +87,18 @@ class AreaProfile:
 
     @property
     def is_cut(self) -> bool:
-        """Whether the field of view cut the head."""
+        """Whether the field of view is known to have cut the head."""
         return any(self.cut)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether there are slices enough to tell whether the field of view cut the head."""
+        return int(self.seen.sum()) >= MIN_SLICES
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the stack is known to show the head from end to end; slices between may be missing."""
+        return self.is_long and not self.is_cut
 
     @property
     def n_inside(self) -> int:
@@ -121,7 +133,7 @@ def area_profiles(slices: Slices) -> list[AreaProfile]:
     """The profile of each stack that has slices, in the order of their numbers."""
     of_stack = [slices.stack_id == stack for stack in np.unique(slices.stack_id)]
     seen = [_profile(slices, one) for one in of_stack]
-    whole = [one.volume_mm3 for one in seen if not one.is_cut]
+    whole = [one.volume_mm3 for one in seen if one.is_whole]
     volume_mm3 = float(np.median(whole)) if whole else None
     return [
         _continued(slices, one, profile, volume_mm3) if profile.is_cut else profile
@@ -132,11 +144,12 @@ def area_profiles(slices: Slices) -> list[AreaProfile]:
 def head_volume_mm3(slices: Slices) -> float:
     """Median over stacks of masked area times slice spacing (mm^3), missing slices included.
 
-    If any stack shows the whole head, only such stacks count.
+    If any stack is known to show the whole head, only such stacks count; else long ones, if there are any.
     """
     profiles = area_profiles(slices)
-    whole = [one for one in profiles if not one.is_cut]
-    return float(np.median([one.volume_mm3 for one in whole or profiles]))
+    whole = [one for one in profiles if one.is_whole]
+    long = [one for one in profiles if one.is_long]
+    return float(np.median([one.volume_mm3 for one in whole or long or profiles]))
 
 
 def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:

@@ -135,10 +135,24 @@ def steps_along_normal_mm(stack: Slices) -> NDArray[np.float64]:
 
     Negative where the numbers rise against the normal; the thickness of a single slice [1].
     """
-    if len(stack) < 2:
-        return stack.thickness_mm[:1]
-    along = stack.header_pose.translation_mm @ stack.header_pose.rotation[0, :, 2]
-    return np.diff(along) / np.diff(stack.slice_index)
+    return _steps_mm(stack, np.arange(len(stack)))
+
+
+def spacing_of_each_mm(slices: Slices) -> NDArray[np.float64]:
+    """Slice spacing [K] of the stack of each slice, see `slice_spacing_mm`; no pixels are copied."""
+    spacing_mm = np.empty(len(slices))
+    for stack in np.unique(slices.stack_id):
+        rows = np.flatnonzero(slices.stack_id == stack)
+        spacing_mm[rows] = np.median(np.abs(_steps_mm(slices, rows)))
+    return spacing_mm
+
+
+def _steps_mm(slices: Slices, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """`steps_along_normal_mm` of the slices [K] of one stack among others."""
+    if len(rows) < 2:
+        return slices.thickness_mm[rows]
+    header = slices.header_pose.take(rows)
+    return np.diff(header.translation_mm @ header.rotation[0, :, 2]) / np.diff(slices.slice_index[rows])
 
 
 def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:

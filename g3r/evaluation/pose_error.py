@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.images import load_volume
+from g3r.acquisition.thinning import thinned
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
@@ -21,7 +22,7 @@ POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 MIN_PIXELS = 30
 """Slices with fewer mask pixels are not scored, because they show no anatomy by which a method could place them."""
 
-POINTS_PER_SLICE = 64
+POINTS_PER_SLICE = 128
 
 ROBUST_SCALE_MM = 2.0
 """Cauchy scale of the fit of the common motion, which a few gross errors must not tilt."""
@@ -98,14 +99,14 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
 
 
 def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey, NDArray[np.float64]]:
-    """Brain points, placed by the headers: up to about 128 points [n, 3] (mm) of each slice with enough mask."""
+    """Brain points, placed by the headers: up to 128 points [n, 3] (mm) of each slice with enough mask."""
     points: dict[SliceKey, NDArray[np.float64]] = {}
     for stack, path in enumerate(mask_paths):
         mask = load_volume(path)
         inside = np.nan_to_num(mask.data) > 0.5
         for k in np.flatnonzero(inside.sum((0, 1)) >= MIN_PIXELS):
             index = np.argwhere(inside[:, :, k])
-            index = index[:: max(1, len(index) // POINTS_PER_SLICE)]
+            index = index[thinned(len(index), POINTS_PER_SLICE)]
             points[stack, int(k)] = mask.grid.world(np.c_[index, np.full(len(index), k)])
     return points
 

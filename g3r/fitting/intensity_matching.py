@@ -23,6 +23,7 @@ from g3r.acquisition.bias_basis import LENGTH_MM, N_TERMS
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.neighbour_gains import MIN_INTENSITY, neighbour_gains
@@ -33,7 +34,7 @@ VOXEL_MM = 2.5
 """About the slice thickness: what differs between slices that cross within a voxel is mostly gain and field."""
 
 MAX_PIXELS = 60_000
-"""Number of evenly spread pixels in use; hundreds of each slice."""
+"""Largest number of pixels in use, evenly spread; hundreds of each slice."""
 
 MIN_STACKS = 3
 """Fewest stacks that are matched. Two stacks leave more open, and their poses are less certain: with matching, eight
@@ -81,7 +82,7 @@ def match_intensities(slices: Slices, gain: Float64Array, weight: NDArray[np.flo
     if slices.n_stacks < MIN_STACKS or not counts.any():
         return MatchedIntensities(slices=slices, gain=gain, coefficients=[])
     index = slices.pixel_index[counts]
-    pixels = _Pixels(slices, index[:: max(1, len(index) // MAX_PIXELS)], weight)
+    pixels = _Pixels(slices, index[thinned(len(index), MAX_PIXELS)], weight)
     factors = pixels.without_shared(pixels.fitted(np.log(gain)[pixels.plane], pixels.weight))
     for _ in range(N_ROUNDS):
         off = pixels.off(factors)

@@ -195,7 +195,7 @@ def _registered_to_fit(
     grid = prior.volumes.grid
     volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * prior.support
     slices: Slices = prior.volumes.slices.with_pose(fit.slices.planes.pose)
-    model = SampledSlices(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
+    model = SampledSlices(slices, volume, grid, n_pixels=MAX_PIXELS)
     gain: NDArray[np.float64] = fit.gain
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     at_start = model.evaluate(slices.planes, gain, width)

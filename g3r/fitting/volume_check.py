@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.best_gains import best_gains
 from g3r.fitting.bias_field import StackBiasField
@@ -114,7 +115,7 @@ def _residuals(
     Returns:
         The relative error of each volume, 0 where no pixel counts. See `check_volume`.
     """
-    index = slices.pixel_index[:: 1 + len(slices.pixel_index) // MAX_PIXELS]
+    index = slices.pixel_index[thinned(len(slices.pixel_index), MAX_PIXELS)]
     operator = VoxelOperator(slices.planes, grid, index)
     number, measured = operator.plane, slices.value[index].astype(np.float64)
     counts = weight[number] * (operator.forward(support.astype(np.float32)) > INSIDE)

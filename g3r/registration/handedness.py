@@ -115,8 +115,8 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry
     own = slices.take(slices.stack_id == stack)
     mirrored = VolumeGrid(grid.shape, MIRROR @ grid.affine)
     moved = _moved_as_one(own, volume, mirrored, rng)
-    stride = max(1, len(own.pixel_index) // MAX_PIXELS)
-    here, there = SampledSlices(own, volume, grid, stride=stride), SampledSlices(moved, volume, mirrored, stride=stride)
+    here = SampledSlices(own, volume, grid, n_pixels=MAX_PIXELS)
+    there = SampledSlices(moved, volume, mirrored, n_pixels=MAX_PIXELS)
     # where the others saw one side alone, the difference is that side, and the stack resembles it
     seen = np.minimum(here.operator.forward(share), there.operator.forward(share)) > SEEN_SHARE
     value, plane = here.value[seen], here.operator.plane[seen]

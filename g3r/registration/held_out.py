@@ -14,6 +14,8 @@ from g3r.acquisition.atlas_template import PlacedHead
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import spacing_of_each_mm
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.motion_segments import changes_in_time, estimate_interleave, transition_penalty
@@ -45,7 +47,7 @@ THIN_VARIANCE = 1 / 6
 between voxels blurs as much."""
 
 PIXELS_OF_VOLUME = 100_000
-"""A volume of the search is made of at most about this many pixels."""
+"""A volume of the search is made of at most this many pixels."""
 
 
 def volume_without(
@@ -61,39 +63,69 @@ def volume_without(
         spacing_mm: voxel size.
         fill: template for voxels that no other stack saw; these are zero without it.
     """
-    operator, value, grid = _of_others(slices, stack, spacing_mm, fill)
-    weight = np.ones(len(value), np.float32)
-    volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
+    others = _of_others(slices, stack, spacing_mm, fill)
+    volume = others.volume(n_iterations=6)
     if fill is not None:
-        volume = filled_with_head(volume, grid, operator.adjoint(weight), fill)
-    return gaussian_filter(volume, 0.5), grid
+        volume = filled_with_head(volume, others.grid, others.coverage(), fill)
+    return gaussian_filter(volume, 0.5), others.grid
 
 
 def coverage_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
-    """Coverage of voxels by all slices except those of one stack, from 0 (unseen) to 1; and the grid.
+    """How far all slices except those of one stack saw each voxel, from 0 (unseen) to 1; and the grid.
 
     Args:
         slices: all slices at their present poses.
         stack: the one to hold out.
         spacing_mm: voxel size.
     """
-    operator, value, grid = _of_others(slices, stack, spacing_mm, None)
-    return coverage_share(operator.adjoint(np.ones(len(value), np.float32))), grid
+    others = _of_others(slices, stack, spacing_mm, None)
+    return coverage_share(others.coverage()), others.grid
+
+
+@dataclass(frozen=True)
+class _Others:
+    """Some pixels of all other stacks, pixels outside the masks included.
+
+    Args:
+        operator: from volumes to the P pixels.
+        value: [P] of the pixels, 0 outside the masks.
+        amount: [P] volume that a pixel stands for (area times slice spacing, for all that were left out) in voxels.
+    """
+
+    operator: VoxelOperator
+    value: NDArray[np.float32]
+    amount: NDArray[np.float32]
+
+    @property
+    def grid(self) -> VolumeGrid:
+        """Grid of the volumes."""
+        return self.operator.grid
+
+    def volume(self, n_iterations: int) -> NDArray[np.float32]:
+        """The volume [I, J, K] by least squares."""
+        weight = np.ones(len(self.value), np.float32)
+        return solve_volume(self.operator, self.value, weight, n_iterations=n_iterations, smoothness=0.1)
+
+    def coverage(self) -> NDArray[np.float32]:
+        """Coverage [I, J, K]: about 1 where one stack looked."""
+        return self.operator.adjoint(self.amount).astype(np.float32)
 
 
 def _of_others(
     slices: Slices, stack: int, spacing_mm: float, fill: PlacedHead | None, n_pixels: int = PIXELS_OF_VOLUME
-) -> tuple[VoxelOperator, NDArray[np.float32], VolumeGrid]:
-    """Operator and values of some pixels of all other stacks, pixels outside the masks included."""
+) -> _Others:
+    """The pixels of all stacks but one: all, or `n_pixels` of them."""
     others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
     if fill is not None:
         grid = grid_with_head(grid, fill)
-    index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // n_pixels))
+    index = thinned(others.planes.n_pixels, n_pixels)
     is_thin = float(others.planes.psf_var_mm2[:, 2].max()) < THIN_VARIANCE * spacing_mm**2
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 1 if is_thin else 3))
     value = np.where(others.mask[index], others.value[index], 0).astype(np.float32)
-    return operator, value, grid
+    pixel_mm3 = others.planes.pixel_area_mm2 * spacing_of_each_mm(others)
+    amount = pixel_mm3 / grid.voxel_volume_mm3 * (others.planes.n_pixels / max(len(index), 1))
+    return _Others(operator, value, amount[operator.plane].astype(np.float32))
 
 
 LEAST_ENERGY = 0.01
@@ -196,16 +228,14 @@ def held_out_score(
 
 
 def fine_volume_without(slices: Slices, stack: int) -> tuple[NDArray[np.float32], NDArray[np.float32], VolumeGrid]:
-    """A volume from all slices except those of one stack, finer than in the search; its coverage; and the grid.
+    """A volume from all slices except those of one stack, finer than in the search; its `coverage_share`; the grid.
 
     Args:
         slices: all slices at their present poses, gains divided out.
         stack: the one to hold out.
     """
-    operator, values, grid = _of_others(slices, stack, FINE_VOXEL_MM, None, FINE_PIXELS_OF_VOLUME)
-    weight = np.ones(len(values), np.float32)
-    volume = solve_volume(operator, values, weight, n_iterations=8, smoothness=0.1)
-    return volume, coverage_share(operator.adjoint(weight)), grid
+    others = _of_others(slices, stack, FINE_VOXEL_MM, None, FINE_PIXELS_OF_VOLUME)
+    return others.volume(n_iterations=8), coverage_share(others.coverage()), others.grid
 
 
 def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> list[float]:
@@ -226,7 +256,7 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     for stack in np.unique(slices.stack_id):
         volume, share, grid = fine_volume_without(evened, stack)
         own = evened.take(evened.stack_id == stack)
-        index = own.pixel_index[:: max(1, len(own.pixel_index) // FINE_PIXELS_OF_VOLUME)]
+        index = own.pixel_index[thinned(len(own.pixel_index), FINE_PIXELS_OF_VOLUME)]
         sampling = VoxelOperator(own.planes, grid, index, (1, 1, 5))
         seen = sampling.forward(share) > 0.5
         predicted, given = sampling.forward(volume)[seen], own.value[index[seen]]

@@ -24,7 +24,7 @@ def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) 
     Args:
         fitted: slices of three or more stacks, in place.
         voxel_mm: of the volumes.
-        max_pixels: number of pixels in use, about, at most.
+        max_pixels: number of pixels in use, at most.
 
     Returns:
         The median over the slices of the other stacks, at the place of that stack, and None for the others: without a

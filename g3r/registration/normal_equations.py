@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.kernels import REORDERED, RUN, locate
 from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.similarity import correlation
@@ -53,14 +54,22 @@ class SampledSlices:
         slices: K slices.
         volume: [I, J, K] on the grid.
         grid: voxel grid.
-        stride: every n-th masked pixel is used (coarse levels).
+        n_pixels: at most so many masked pixels are used (coarse levels); all when None.
         psf_points: quadrature nodes through the slice.
     """
 
     def __init__(
-        self, slices: Slices, volume: NDArray[np.float32], grid: VolumeGrid, *, stride: int = 1, psf_points: int = 5
+        self,
+        slices: Slices,
+        volume: NDArray[np.float32],
+        grid: VolumeGrid,
+        *,
+        n_pixels: int | None = None,
+        psf_points: int = 5,
     ) -> None:
-        index = slices.pixel_index[::stride]
+        index = slices.pixel_index
+        if n_pixels is not None:
+            index = index[thinned(len(index), n_pixels)]
         self.operator = VoxelOperator(slices.planes, grid, index, (1, 1, psf_points))
         self.value = slices.value[index]
         self.volume = np.ascontiguousarray(volume, dtype=np.float32)

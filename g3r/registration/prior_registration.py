@@ -41,7 +41,7 @@ def register_to_prior(
     Returns:
         Slices, gains, and whether they were moved; the given ones where too little of the loss was removed.
     """
-    model = SampledSlices(slices, prior, grid, stride=max(1, len(slices.pixel_index) // 100_000))
+    model = SampledSlices(slices, prior, grid, n_pixels=100_000)
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     before = model.evaluate(slices.planes, gain, width)
     moved, new_gain, after = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)

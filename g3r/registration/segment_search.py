@@ -210,6 +210,6 @@ def _rigid_motion(stack: Slices, motion: RigidPose, volume: NDArray[np.float32],
     """The best single motion [K, all the same] near motions [K]."""
     identity = RigidPose.identity(len(stack))
     mean = aligned_to(stack, motion, identity)
-    model = SampledSlices(stack, volume, grid, stride=max(1, len(stack.pixel_index) // 15_000), psf_points=3)
+    model = SampledSlices(stack, volume, grid, n_pixels=15_000, psf_points=3)
     pose = refine_stack(model, stack, mean @ stack.header_pose, n_steps=10)
     return pose @ stack.header_pose.inverse()

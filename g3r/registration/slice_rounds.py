@@ -13,6 +13,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width, slice_weights
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import SampledSlices
@@ -139,10 +140,9 @@ class _Rounds:
         smoothness = 0.1 if fraction < 0.2 else 0.03 if fraction < 0.7 else 0.01
         if self.grid is None or not np.isclose(self.grid.spacing_mm[0], voxel):
             self.grid, self.volume = grid_around(self.slices, voxel), None
-        n_wanted = settings.max_pixels / (voxel / settings.finest_voxel_mm)
-        stride = max(1, round(len(self.slices.pixel_index) / n_wanted))
-        self.volume = _volume_of(self.slices, self.grid, self.gain, self.weight, self.volume, smoothness, stride)
-        model = SampledSlices(self.slices, self.volume, self.grid, stride=stride)
+        n_pixels = round(settings.max_pixels / (voxel / settings.finest_voxel_mm))
+        self.volume = _volume_of(self.slices, self.grid, self.gain, self.weight, self.volume, smoothness, n_pixels)
+        model = SampledSlices(self.slices, self.volume, self.grid, n_pixels=n_pixels)
         width = robust_width(model.residuals(self.slices.planes, self.gain), n_sigma=2)
         moved = n_found
         if 0.1 < fraction < 0.8:
@@ -188,13 +188,12 @@ def fitted_in_place(slices: Slices, settings: RegistrationSettings, progress: Pr
     """
     voxel, n_rounds = settings.finest_voxel_mm, N_ROUNDS_IN_PLACE if slices.n_stacks > 1 else 0
     gain, weight = np.ones(len(slices)), np.ones(len(slices))
-    stride = max(1, round(len(slices.pixel_index) / settings.max_pixels))
     grid, volume = grid_around(slices, voxel), None
     history: list[dict[str, float]] = []
     for number in range(n_rounds):
         progress(number, n_rounds)
-        volume = _volume_of(slices, grid, gain, weight, volume, 0.03, stride)
-        model = SampledSlices(slices, volume, grid, stride=stride)
+        volume = _volume_of(slices, grid, gain, weight, volume, 0.03, settings.max_pixels)
+        model = SampledSlices(slices, volume, grid, n_pixels=settings.max_pixels)
         width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
         fit = model.evaluate(slices.planes, gain, width)
         log_gain = np.log(best_gain(fit.moments, GAIN_RANGE_IN_PLACE))
@@ -216,9 +215,9 @@ def _volume_of(
     weight: NDArray[np.float64],
     start: NDArray[np.float32] | None,
     smoothness: float,
-    stride: int,
+    n_pixels: int,
 ) -> NDArray[np.float32]:
-    index = slices.pixel_index[::stride]
+    index = slices.pixel_index[thinned(len(slices.pixel_index), n_pixels)]
     operator = VoxelOperator(slices.planes, grid, index, (1, 1, 5))
     value = slices.value[index] / gain[operator.plane]
     pixel_weight = weight[operator.plane].astype(np.float32)
@@ -258,8 +257,8 @@ def correlation_with_all(
         gain: [K] intensity factors.
         weight: [K] slice weights.
         voxel_mm: of the volume.
-        max_pixels: number of pixels in use, about, at most.
+        max_pixels: number of pixels in use, at most.
     """
-    grid, stride = grid_around(slices, voxel_mm), max(1, round(len(slices.pixel_index) / max_pixels))
-    volume = _volume_of(slices, grid, gain, weight, None, 0.03, stride)
-    return SampledSlices(slices, volume, grid, stride=stride).evaluate(slices.planes, gain, 1.0).ncc
+    grid = grid_around(slices, voxel_mm)
+    volume = _volume_of(slices, grid, gain, weight, None, 0.03, max_pixels)
+    return SampledSlices(slices, volume, grid, n_pixels=max_pixels).evaluate(slices.planes, gain, 1.0).ncc

@@ -18,6 +18,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import rotation_matrix, skew
@@ -78,13 +79,11 @@ def self_consistency(stack: Slices) -> float:
 
 def _register_one(moving: Slices, fixed: Slices) -> tuple[RigidPose, float]:
     grid = grid_around(fixed, SEARCH_VOXEL_MM, margin_mm=20.0)
-    stride = max(1, len(fixed.pixel_index) // 120_000)
-    index = fixed.pixel_index[::stride]
+    index = fixed.pixel_index[thinned(len(fixed.pixel_index), 120_000)]
     operator = VoxelOperator(fixed.planes, grid, index, (1, 1, 5))
     volume = solve_volume(operator, fixed.value[index], np.ones(len(index), np.float32), smoothness=0.1)
     volume = gaussian_filter(volume, 0.8)
-    stride = max(1, len(moving.pixel_index) // 15_000)
-    coarse = SampledSlices(moving, volume, grid, stride=stride, psf_points=3)
+    coarse = SampledSlices(moving, volume, grid, n_pixels=15_000, psf_points=3)
     moving_center, fixed_center = _centroid(moving), _centroid(fixed)
     starts = []
     for angles in itertools.product(SEARCH_ANGLES_DEG, repeat=3):
@@ -95,7 +94,7 @@ def _register_one(moving: Slices, fixed: Slices) -> tuple[RigidPose, float]:
             pose = motion @ moving.planes.pose
             starts.append((_agreement(coarse, moving, pose), pose))
     starts.sort(key=lambda item: -item[0])
-    fine = SampledSlices(moving, volume, grid, stride=max(1, stride // 3), psf_points=3)
+    fine = SampledSlices(moving, volume, grid, n_pixels=45_000, psf_points=3)
     refined = []
     for _, pose in starts[:N_REFINED]:
         pose = refine_stack(coarse, moving, pose, n_steps=8)

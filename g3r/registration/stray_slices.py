@@ -18,6 +18,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import DARK, DROPPED_WEIGHT
+from g3r.acquisition.thinning import thinned
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.motion_segments import cheapest_path, estimate_interleave, time_orders, transition_penalties
@@ -104,8 +105,8 @@ def find_strays(
     volume, grid = _volume_of_others(slices, gain, np.where(astray, 0.0, weight))
     motion = slices.world_from_header()
     at_home = mean_square_residual(own_moments(pixels, volume, grid, motion))
-    search = _Search(slices, volume, grid, noise=float(np.median(at_home[fits])) + 1e-12, center_mm=pixels.center_mm)
-    known, n_found = distinct(motion.take(np.flatnonzero(fits)), pixels.center_mm), 0
+    search = _Search(slices, volume, grid, noise=float(np.median(at_home[fits])) + 1e-12)
+    known, n_found = motion.take(np.flatnonzero(fits)), 0
     for stack in np.unique(slices.stack_id[astray]):
         rows = np.flatnonzero(slices.stack_id == stack)
         new, moved = search.of_stack(rows, motion.take(rows), astray[rows], known, rng)
@@ -122,25 +123,20 @@ class _Search:
         volume: [I, J, K] of the slices that fit, zero outside the masks.
         grid: its grid.
         noise: mean square residual of a slice that fits.
-        center_mm: [3] of the head before its motions.
     """
 
-    def __init__(
-        self,
-        slices: Slices,
-        volume: NDArray[np.float32],
-        grid: VolumeGrid,
-        *,
-        noise: float,
-        center_mm: NDArray[np.float64],
-    ) -> None:
+    def __init__(self, slices: Slices, volume: NDArray[np.float32], grid: VolumeGrid, *, noise: float) -> None:
         self.slices = slices
-        self.volume, self.grid, self.noise, self.center_mm = volume, grid, noise, center_mm
+        self.volume, self.grid, self.noise = volume, grid, noise
+
+    def by_header(self, rows: NDArray[np.int64]) -> SearchPixels:
+        """Pixels of slices at their header poses."""
+        own = self.slices.take(rows)
+        return SearchPixels.of(own.with_pose(own.header_pose))
 
     def costs(self, rows: NDArray[np.int64], motion: RigidPose) -> NDArray[np.float64]:
         """Negative log likelihood [S, J] of slices under motions (`student_cost`)."""
-        own = self.slices.take(rows)
-        pixels = SearchPixels.of(own.with_pose(own.header_pose))
+        pixels = self.by_header(rows)
         residual = mean_square_residual(pixels.moments(self.volume, self.grid, motion)).T
         return student_cost(residual, self.noise, pixels.area_mm2)
 
@@ -161,12 +157,15 @@ class _Search:
             known: motions of slices that fit.
             rng: source of random motions.
         """
+        # of this stack alone: headers may place stacks far apart, and turns about a far point move the head a long way
+        center_mm = self.by_header(rows).center_mm
         index = self.slices.slice_index[rows]
-        order = time_orders(index)[estimate_interleave(motion, index, self.center_mm)]
+        order = time_orders(index)[estimate_interleave(motion, index, center_mm)]
         wanted = np.flatnonzero(astray)
-        found, n_each = known, max(1, N_FIRST // len(known))
+        found = distinct(known, center_mm)
+        n_each = max(1, N_FIRST // len(found))
         for (rotation_deg, translation_mm), n_kept in zip(STEPS, N_KEPT, strict=True):
-            tried = perturbed(found, self.center_mm, n_each, rotation_deg, translation_mm, rng)
+            tried = perturbed(found, center_mm, n_each, rotation_deg, translation_mm, rng)
             cost = self.costs(rows[wanted], tried)
             best = np.argpartition(cost, min(n_kept, len(tried)) - 1, axis=1)[:, :n_kept]
             found, n_each = tried.take(np.unique(best)), N_EACH
@@ -175,7 +174,7 @@ class _Search:
         cost = np.full((len(rows), len(candidate)), UNREACHABLE)
         cost[np.arange(len(rows)), np.arange(len(rows))] = 0.0
         cost[wanted] = self.costs(rows[wanted], candidate)
-        path, _ = cheapest_path(cost[order], transition_penalties(candidate, self.center_mm))
+        path, _ = cheapest_path(cost[order], transition_penalties(candidate, center_mm))
         choice = np.empty(len(rows), np.int64)
         choice[order] = path
         gained = cost[wanted, wanted] - cost[wanted, choice[wanted]]
@@ -190,7 +189,7 @@ def _volume_of_others(
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
     """A volume of slices that fit, zero outside the masks, and its grid."""
     grid = grid_around(slices, VOXEL_MM, margin_mm=20.0)
-    index = np.arange(0, slices.planes.n_pixels, max(1, slices.planes.n_pixels // PIXELS_OF_VOLUME))
+    index = thinned(slices.planes.n_pixels, PIXELS_OF_VOLUME)
     operator = VoxelOperator(slices.planes, grid, index, (1, 1, 3))
     value = np.where(slices.mask[index], slices.value[index], 0) / gain[operator.plane]
     counts = np.where(weight < DROPPED_WEIGHT, 0.0, weight)[operator.plane]

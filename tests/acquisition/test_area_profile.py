@@ -86,3 +86,25 @@ def test_few_slices_are_taken_as_they_are(whole: Slices) -> None:
     (found,) = area_profiles(few)
     assert not found.has_missing
     assert found.seen.all()
+
+
+def test_a_fragment_does_not_count_as_a_whole_head(whole: Slices) -> None:
+    """Three slices at one end of a stack, beside a stack that is whole, and beside two that are cut."""
+    true_mm3, lost = head_volume_mm3(whole), np.flatnonzero(whole.stack_id == 0)[3:]
+    with_fragment = whole.take(np.setdiff1d(np.arange(len(whole)), lost))
+    beside_whole = with_fragment.take(with_fragment.stack_id < 2)
+    assert head_volume_mm3(beside_whole) == pytest.approx(true_mm3, rel=0.05)
+    beside_cut = without(without(with_fragment, 1, 0.0, 0.3), 2, 0.0, 0.3)
+    assert head_volume_mm3(beside_cut) == pytest.approx(true_mm3, rel=0.25)
+    fragment, *cut = area_profiles(beside_cut)
+    assert not fragment.is_cut
+    assert not fragment.is_whole
+    for profile in cut:
+        assert profile.is_cut
+        assert profile.volume_mm3 == pytest.approx(true_mm3, rel=0.25)
+
+
+def test_fragments_alone_are_all_there_is(whole: Slices) -> None:
+    few = whole.take(np.concatenate([np.flatnonzero(whole.stack_id == stack)[8:11] for stack in range(3)]))
+    volumes = [one.volume_mm3 for one in area_profiles(few)]
+    assert head_volume_mm3(few) == np.median(volumes) > 0

@@ -4,9 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
-from g3r.acquisition.planes import Slices
-from g3r.geometry import RigidPose
+from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import held_out
 from g3r.registration.held_out import (
     best_initialisation,
@@ -141,6 +145,34 @@ def test_a_stack_of_which_others_saw_nothing_correlates_by_zero(still_slices: tu
     center = slices.planes.center_mm + np.array([0.0, 0.0, 500.0]) * (slices.stack_id == 2)[:, None]
     apart = slices.with_pose(RigidPose(slices.planes.rotation, center)).take(slices.stack_id != 1)
     assert fine_held_out_correlations(apart, np.ones(len(apart))) == [0.0, 0.0]
+
+
+def test_wide_rectangular_masks_do_not_hide_columns() -> None:
+    """Every 32nd of 256 x 256 pixels lies in 8 columns of all slices; true poses then predict each other badly."""
+    grid = VolumeGrid.isotropic([-56] * 3, [56] * 3, 2.0)
+    blobs = gaussian_filter(np.random.default_rng(0).normal(size=grid.shape), 2.0)
+    volume = (1 + 0.3 * blobs / blobs.std()).astype(np.float32)
+    turns = Rotation.from_rotvec(np.pi / 2 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])).as_matrix()
+    stack_id = np.repeat(np.arange(3), 25)
+    rotation = turns[stack_id]
+    planes = Planes(
+        rotation=rotation,
+        center_mm=4.0 * (np.tile(np.arange(25), 3) - 12)[:, None] * rotation[:, :, 2],
+        spacing_mm=np.full((75, 2), 0.4),
+        shape=np.full((75, 2), 256),
+        psf_var_mm2=np.tile(psf_variance_mm2([0.4, 0.4], 4.0), (75, 1)),
+    )
+    slices = Slices(
+        planes=planes,
+        value=VoxelOperator(planes, grid).forward(volume),
+        mask=np.ones(planes.n_pixels, bool),
+        stack_id=stack_id,
+        slice_index=np.tile(np.arange(25), 3),
+        thickness_mm=np.full(75, 4.0),
+        header_pose=planes.pose,
+    )
+    score = held_out_score(slices, StackSamples.of_all(slices), RigidPose.identity(75))
+    assert min(score.correlations) > 0.9
 
 
 def test_the_profile_of_thin_slices_is_left_out_of_coarse_volumes(

@@ -80,6 +80,21 @@ def test_rounds_end_with_the_search(still_slices: tuple[Slices, RigidPose], astr
     assert found.weight[at].min() > without.weight[at].max()
 
 
+def test_strays_are_found_where_headers_place_the_stacks_far_apart(
+    still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]
+) -> None:
+    """Turns are about the head of the stack by its own header, so it stays about where it was."""
+    slices, at = astray
+    header = slices.header_pose
+    far = np.array([0.0, 250.0, 0.0]) * (slices.stack_id[:, None] != STACK)
+    apart = replace(slices, header_pose=RigidPose(header.rotation, header.translation_mm + far))
+    weight = np.ones(len(slices))
+    weight[at] = 1e-3
+    found, n_found = find_strays(apart, np.ones(len(slices)), weight, np.ones(len(slices)), rng())
+    assert n_found == len(at)
+    assert off_mm(found, still_slices[0])[at].max() < 4.0  # the slice thickness
+
+
 def test_slices_that_fit_cost_no_search(still_slices: tuple[Slices, RigidPose]) -> None:
     slices, ones = still_slices[0], np.ones(len(still_slices[0]))
     assert find_strays(slices, ones, ones, ones, rng()) == (slices, 0)

@@ -5,10 +5,11 @@ import pytest
 
 from g3r.acquisition.area_profile import area_profiles
 from g3r.acquisition.atlas_template import PlacedHead
-from g3r.acquisition.planes import Slices
+from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.psf import psf_variance_mm2
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import rotation_matrix
-from g3r.registration.held_out import held_out_score, volume_without
+from g3r.registration.held_out import coverage_without, held_out_score, volume_without
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.overlap import overlap_of
 from g3r.registration.similarity import StackSamples
@@ -58,6 +59,62 @@ def test_share_of_coverage() -> None:
     assert 0 < share[1] < 1
     assert (share[2:] == 1).all()
     assert (coverage_share(np.zeros(4, np.float32)) == 0).all()
+
+
+def box_stacks(*stacks: tuple[np.ndarray, float, np.ndarray]) -> Slices:
+    """Stacks about the origin, 60 mm wide: rotation [3, 3], size of pixels (mm), and heights of slices (mm) of each."""
+    n = [len(height) for _, _, height in stacks]
+    rotation = np.concatenate([np.tile(turn, (len(height), 1, 1)) for turn, _, height in stacks])
+    height_mm = np.concatenate([height for *_, height in stacks])
+    pixel_mm = np.repeat([pixel for _, pixel, _ in stacks], n)
+    spacing_mm = np.repeat([float(np.diff(height).min()) for *_, height in stacks], n)
+    planes = Planes(
+        rotation=rotation,
+        center_mm=height_mm[:, None] * rotation[:, :, 2],
+        spacing_mm=np.stack([pixel_mm, pixel_mm], axis=1),
+        shape=np.rint(60 / np.stack([pixel_mm, pixel_mm], axis=1)).astype(int),
+        psf_var_mm2=psf_variance_mm2(np.stack([pixel_mm, pixel_mm], axis=1), spacing_mm),
+    )
+    return Slices(
+        planes=planes,
+        value=np.ones(planes.n_pixels, np.float32),
+        mask=np.ones(planes.n_pixels, bool),
+        stack_id=np.repeat(np.arange(len(stacks)), n),
+        slice_index=np.concatenate([np.rint((one - one[0]) / np.diff(one).min()).astype(int) for *_, one in stacks]),
+        thickness_mm=spacing_mm,
+        header_pose=planes.pose,
+    )
+
+
+SAGITTAL = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+
+
+def seen_at(slices: Slices, points_mm: np.ndarray) -> np.ndarray:
+    """How far all stacks saw points [P, 3]."""
+    share, grid = coverage_without(slices, -1, 3.2)
+    return sampled(share, grid, points_mm)
+
+
+@pytest.mark.parametrize("n_lower", [0, 1, 2, 11])
+def test_what_one_stack_saw_is_seen_however_many_others_did_not(n_lower: int) -> None:
+    whole, lower = np.arange(-28.0, 30, 4), np.arange(-28.0, 0, 4)
+    slices = box_stacks((SAGITTAL, 1.0, whole), *[(np.eye(3), 1.0, lower)] * n_lower)
+    points_mm = np.random.default_rng(0).uniform(-26, 26, (500, 3))
+    upper = points_mm[:, 2] > 6
+    share = seen_at(slices, points_mm)
+    assert (share > 0.5).mean() > 0.99
+    assert share[upper].mean() > 0.95
+    assert seen_at(slices, points_mm + np.array([0, 0, 50]))[upper].max() == 0
+
+
+@pytest.mark.parametrize(("coarse_mm", "fine_mm"), [(2.0, 0.5), (1.0, 1.0), (0.5, 2.0)])
+def test_what_one_stack_saw_is_seen_whatever_the_pixels_of_another(coarse_mm: float, fine_mm: float) -> None:
+    whole, height = np.arange(-27.0, 30, 4), np.arange(-29.0, 30, 2)
+    slices = box_stacks((SAGITTAL, coarse_mm, whole), (np.eye(3), fine_mm, height[np.abs(height) > 12]))
+    points_mm = np.random.default_rng(0).uniform(-26, 26, (500, 3)) * [1, 1, 0.25]
+    share = seen_at(slices, points_mm)
+    assert (share > 0.5).mean() > 0.99
+    assert share.mean() > 0.95
 
 
 def test_sampled_is_zero_outside() -> None:
