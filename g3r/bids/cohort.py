@@ -135,7 +135,7 @@ class Cohort:
             InputError: the executor cannot run them.
         """
         works = []
-        for session in sessions:
+        for session in filter(lambda one: one.stacks, sessions):
             has_failed = failure_path(session, self.out_dir).exists()  # perhaps where it was to be replaced
             if record_path(session, self.out_dir).exists() and not has_failed and not self.force:
                 self.say(f"{session.stem}: was done before")
@@ -161,13 +161,8 @@ class Cohort:
         """The command of a session.
 
         Raises:
-            InputError: it has no stack, its masks are ambiguous, or a sidecar cannot be read.
+            InputError: its masks are ambiguous, or a sidecar cannot be read.
         """
-        if not session.stacks:
-            raise InputError(
-                f"{session.stem}: none of its T2w files is a stack as it was scanned ({', '.join(session.left_out)}); "
-                f"expected {session.stem}[_acq-*][_run-*]_T2w.nii.gz, rename them"
-            )
         folder = self.out_dir / WORK / session.stem
         masks = [] if self.whole_image else find_masks(session, self.bids_dir, self.out_dir, self.mask_derivative)
         stacks = [self._with_inherited(stack, folder / "stacks") for stack in session.stacks]

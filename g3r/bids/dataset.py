@@ -23,7 +23,7 @@ class Session:
     Attributes:
         participant, session: labels; session is None if the data set has none.
         stacks: T2w images of its anat folder, in order of their names.
-        left_out: names of T2w images that are not stacks; where there is no other, the session cannot be reconstructed.
+        left_out: names of T2w images that are not stacks; where there is no other, the session is passed over.
     """
 
     participant: str

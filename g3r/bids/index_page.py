@@ -8,13 +8,13 @@ from pathlib import Path
 from urllib.parse import quote
 
 from g3r.bids.derivative import REPORT, THUMBNAIL, figure_path
-from g3r.bids.outcome import FAILED, NOT_RUN, Outcome, log_path
+from g3r.bids.outcome import FAILED, NO_STACK, NOT_RUN, Outcome, log_path
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, USE
 from g3r.run.atomic_file import write_text
 
 PAGE = "index.html"
 
-WORST_FIRST = (FAILED, DO_NOT_USE, CHECK, NOT_RUN, USE)
+WORST_FIRST = (FAILED, DO_NOT_USE, CHECK, NOT_RUN, NO_STACK, USE)
 
 TITLES = ("session", "verdict", "slices", "unseen", "why", "picture")
 

@@ -13,7 +13,7 @@ from g3r.errors import InputError
 from g3r.report.verdict_messages import MILDEST_FIRST
 from g3r.run.atomic_file import write_text
 
-FAILED, NOT_RUN = "failed", "not run"
+FAILED, NOT_RUN, NO_STACK = "failed", "not run", "no stack"
 """Words of a session without a verdict."""
 
 
@@ -23,7 +23,7 @@ class Outcome:
 
     Attributes:
         session: session of the data set.
-        verdict: verdict of run.json, or "failed" or "not run".
+        verdict: verdict of run.json, or "failed", "not run" or "no stack".
         seconds: duration of the run.
         n_stacks, n_slices, n_used: stacks in the volume, slices of all stacks, and slices of at least half the full
             weight.
@@ -76,6 +76,8 @@ def write_failure(session: Session, out_dir: Path, reason: str, seconds: float |
 def outcome_of(session: Session, out_dir: Path) -> Outcome:
     """The outcome of a session, from the files in the derivative data set."""
     failure, record = failure_path(session, out_dir), record_path(session, out_dir)
+    if not session.stacks:
+        return Outcome(session=session, verdict=NO_STACK, reasons=(f"not read: {', '.join(session.left_out)}",))
     try:
         if failure.exists():
             said = read_object(failure)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
+from g3r.acquisition.cut_images import cut_at_mask
 from g3r.acquisition.planes import Slices
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.voxel_problem import FitPixels, Float32Array, VoxelProblem, VoxelProblemSettings, too_fine
@@ -106,11 +107,16 @@ def _depth_mm(support: NDArray[np.bool_], grid: VolumeGrid) -> Float32Array:
 
 
 def _around(fit: SliceFit, acquired: Slices, depth_mm: Float32Array, grid: VolumeGrid) -> FitPixels | None:
-    """Pixels near the edge, masked or not; None if something lies beside the brain, or if no pixel shows it."""
+    """Pixels near the edge, masked or not; None if something lies beside the brain, or if no pixel shows it.
+
+    Zeros beyond the masks of images that were cut there show nothing (`acquisition.cut_images`).
+    """
     slices = replace(fit.slices, value=acquired.value, mask=np.ones_like(acquired.mask))
     pixels = FitPixels.of(fit, slices, np.ones(len(slices.value), np.float32))
     place = grid.index(slices.planes.pixel_world_mm()).T
     depth = map_coordinates(depth_mm, place, order=1, mode="nearest")
+    measured = acquired.mask | ~cut_at_mask(acquired)[pixels.plane]
+    pixels, depth = pixels.take(measured), depth[measured]
     near, far = BESIDE_MM
     brain, beside = pixels.value[depth > near], pixels.value[(depth < -near) & (depth > -far)]
     if not len(brain) or not len(beside):

@@ -292,7 +292,7 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[Ina
     if not settings.use_prior:
         found.append(InactiveTerm("distance to the prior", "no prior is in use"))
     elif not settings.distillation:
-        off, worse = "switched off in the settings", "several stacks are nearer to the truth without it"
+        off, worse = "distillation is switched off", "several stacks are nearer to the truth without it"
         reason = off if single else worse
         found.append(InactiveTerm("distance to the prior", reason))
     return found

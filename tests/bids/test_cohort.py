@@ -260,7 +260,7 @@ def test_an_interrupted_session_keeps_its_threads(tmp_path: Path, monkeypatch: p
     assert other.with_threads(2, as_before=True).words[-1] == "2"
 
 
-def test_a_session_without_a_stack_fails_alone(
+def test_a_session_without_a_stack_is_in_the_table(
     raw: Path, use: Use, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use()
@@ -269,8 +269,9 @@ def test_a_session_without_a_stack_fails_alone(
     assert anat.is_dir()
     monkeypatch.chdir(tmp_path)
     raw.rename(tmp_path / "-raw")
-    assert main(["./-raw", "out", "participant"]) == 1
-    assert rows(tmp_path / "out")["sub-07"]["reasons"].startswith("sub-07: none of its T2w files is a stack")
+    assert main(["./-raw", "out", "participant"]) == 0
+    row = rows(tmp_path / "out")["sub-07"]
+    assert (row["verdict"], row["reasons"]) == ("no stack", "not read: sub-07_rec-other_T2w.nii.gz")
     assert len(volumes(tmp_path / "out")) == N - 1
     words = events(tmp_path)[0]["words"]
     assert Path(words[words.index("--stacks") + 1]).is_absolute()

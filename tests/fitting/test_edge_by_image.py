@@ -126,6 +126,19 @@ def test_masks_decide_where_no_pixel_beside_the_brain_is_kept() -> None:
     assert shown(slices_of(planes, value, mask, 3, 2.0)) is None
 
 
+def test_zeros_beyond_the_masks_show_no_edge() -> None:
+    """Of images that were cut at their masks: there, pixels on the edge hold brain, too."""
+    slices = slices_that_see(0.0, mask_mm=BRAIN_MM)
+    cut = replace(slices, value=np.where(slices.mask, slices.value, 0).astype(np.float32))
+    assert shown(slices) is not None
+    assert shown(cut) is None
+    # one stack that was not cut shows it
+    whole = cut.planes.plane_id() < np.count_nonzero(cut.stack_id == 0)
+    found = shown(replace(cut, value=np.where(whole, slices.value, cut.value)))
+    assert found is not None
+    assert found[(RADIUS_MM < BRAIN_MM) & SUPPORT].mean() > 0.9
+
+
 def test_nothing_is_asked_of_black_images() -> None:
     slices = slices_that_see(0.0)
     assert shown(replace(slices, value=np.zeros_like(slices.value))) is None
