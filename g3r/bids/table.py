@@ -14,8 +14,8 @@ TABLE, DICTIONARY = "participants_g3r.tsv", "participants_g3r.json"
 COLUMNS = {
     "participant_id": "participant",
     "session_id": "session; n/a where the data set has none",
-    "verdict": "use, check (look at the figures) or do not use, as in run.json and on the terminal; failed; not run; no "
-    "stack",
+    "verdict": "use, check (look at the figures) or do not use, as in run.json and on the terminal; failed; not run; "
+    "no stack",
     "seconds": "of the run",
     "stacks": "stacks in the volume, without those that were left out",
     "slices_used": "slices of at least half the full weight",
