@@ -140,12 +140,19 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         return synthesise(truth, head, rng, n_stacks, self.artefact_share)
 
     def _template_head(self, weeks: float, rng: np.random.Generator) -> PlacedHead:
-        """The template to fit: nearest in age for validation, and of another age for training if there is one."""
+        """The template to fit: nearest in age for validation, and of another age for training.
+
+        Where all are nearer than `OTHER_AGE_WEEKS` asks for, it is the furthest: the nearest may be a mean of few heads
+        with the subject among them, and the network would learn to trust it.
+        """
         apart = np.abs(self.template.weeks - weeks)
         nearest, furthest = OTHER_AGE_WEEKS
         others = np.flatnonzero((apart >= nearest) & (apart <= furthest))
-        chosen = int(apart.argmin()) if self.in_order or not len(others) else int(rng.choice(others))
-        return self.template.head(chosen)
+        if self.in_order:
+            return self.template.head(int(apart.argmin()))
+        if not len(others):
+            others = np.array([apart.argmin() if apart.min() > furthest else apart.argmax()])
+        return self.template.head(int(rng.choice(others)))
 
 
 def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int]) -> list[NDArray[np.int64]]:

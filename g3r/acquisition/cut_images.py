@@ -1,16 +1,25 @@
-"""Images that were set to zero beyond their masks, as brain extraction leaves them."""
+"""Images that were set to zero around the brain, as brain extraction leaves them, or around their field of view."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, binary_fill_holes
 
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.stacks import Stack
+from g3r.geometry.grid import bounding_box
 
 MOSTLY = 0.9
 """Share of the pixels beside its mask from which on a stack is cut: simulated stacks of a head in black have no zeros
-there, or a few where they have no noise, since these pixels are partly brain; masked ones have nothing else."""
+there, or a few where they have no noise, since these pixels are partly brain; masked ones have nothing else. Also the
+share of a rectangle that must not be zero for it to be a field of view."""
+
+NEARLY_ZERO = 1e-3
+"""Share of the median in the mask below which a pixel was set to zero, and perhaps resampled since."""
+
+FEW = 0.01
+"""Share of zeros in a mask that noise or rounding may leave."""
 
 
 def cut_at_mask(slices: Slices) -> NDArray[np.bool_]:
@@ -18,12 +27,53 @@ def cut_at_mask(slices: Slices) -> NDArray[np.bool_]:
 
     What is zero there was not measured: pixels whose middle lies just outside the mask hold brain, too.
     """
-    beside, zero = np.zeros(len(slices)), np.zeros(len(slices))
-    for k, (shape, start) in enumerate(zip(slices.planes.shape, slices.planes.offset[:-1], strict=True)):
-        pixels = slice(start, start + int(shape.prod()))
-        mask, value = (one[pixels].reshape(shape) for one in (slices.mask, slices.value))
-        rim = value[binary_dilation(mask) & ~mask]
-        beside[k], zero[k] = len(rim), np.count_nonzero(rim == 0)
-    _, stack = np.unique(slices.stack_id, return_inverse=True)
-    n_beside, n_zero = (np.bincount(stack, one) for one in (beside, zero))
-    return (n_zero > MOSTLY * n_beside)[stack]
+    cut = np.zeros(len(slices), bool)
+    plane = slices.planes.plane_id()
+    for stack in np.unique(slices.stack_id):
+        own = slices.stack_id == stack
+        rows = np.flatnonzero(own)
+        inside = np.abs(slices.value[own[plane] & slices.mask])
+        limit = NEARLY_ZERO * float(np.median(inside)) if inside.size else 0.0
+        rims = [_beside_mask(slices, k) for k in rows.tolist()]
+        beside = np.abs(np.concatenate(rims))
+        cut[rows] = np.count_nonzero(beside <= limit) > MOSTLY * len(beside)
+    return cut
+
+
+def _beside_mask(slices: Slices, k: int) -> NDArray[np.float32]:
+    start, shape = slices.planes.offset[k], slices.planes.shape[k]
+    pixels = slice(start, start + int(shape.prod()))
+    mask, value = (one[pixels].reshape(shape) for one in (slices.mask, slices.value))
+    return np.asarray(value[binary_dilation(mask) & ~mask])
+
+
+def mask_of_content(stack: Stack) -> NDArray[np.bool_]:
+    """The mask [I, J, K] without the zeros around an image that was cut out more narrowly than its mask.
+
+    Zeros that content surrounds stay, and so do slices that are zero throughout.
+    """
+    zero = (stack.image == 0) & stack.mask
+    if zero.sum() <= FEW * stack.mask.sum():
+        return stack.mask
+    mask = stack.mask.copy()
+    for k in np.flatnonzero((stack.mask & ~zero).any((0, 1))):
+        mask[:, :, k] &= binary_fill_holes(stack.image[:, :, k] != 0)
+    return mask
+
+
+def field_of_view(stack: Stack) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First and last index, along both axes of a slice, of the pixels that were acquired.
+
+    All of them, unless zeros pad a rectangle of pixels that mostly are not zero.
+    """
+    whole = tuple((0, n - 1) for n in stack.image.shape[:2])
+    content = stack.image != 0
+    seen = content.any(2)
+    if not seen.any():
+        return whole[0], whole[1]
+    box = bounding_box(seen)
+    in_box = content[box][:, :, content.any((0, 1))]
+    if in_box.mean() < MOSTLY:
+        return whole[0], whole[1]
+    rows, columns = ((axis.start, axis.stop - 1) for axis in box)
+    return rows, columns

@@ -29,6 +29,10 @@ MASK_SHIFT_TOLERANCE_VOXELS = 0.5
 MAX_LABELS = 256
 """A mask with more distinct values above 1 than this is an image."""
 
+SCALED_TO, FEWEST_STEPS, NEAR_TOP = (100.0, 255.0), 40, 0.9
+"""Maxima of probabilities that were scaled to whole numbers, fewest values above 1 of such a mask, and share of the
+maximum that most of its brain reaches."""
+
 
 @dataclass(frozen=True)
 class Volume:
@@ -99,7 +103,7 @@ def read_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
     mask = load_volume(path)
     check_grid(mask, reference.grid, f"that of {reference.name}", "mask")
     _check_mask_values(mask)
-    return np.nan_to_num(mask.data) > 0.5
+    return np.nan_to_num(mask.data) > _threshold(mask.data)
 
 
 def check_grid(found: Volume, expected: VolumeGrid, of: str, kind: str) -> None:
@@ -137,6 +141,17 @@ def _check_mask_values(mask: Volume) -> None:
             f"{mask.name}: holds values up to {above.max():g} as an image does; expected a mask of 0 and 1 "
             "(or labels, or a probability); pass the mask that belongs to the stack"
         )
+
+
+def _threshold(mask: NDArray[np.floating]) -> float:
+    """Value above which a mask's voxel is brain: half of 1, or of the 100 or 255 to which a probability was scaled.
+
+    Labels may reach these numbers, too, but a probability is near its maximum in most of the brain.
+    """
+    top = float(np.nanmax(mask, initial=0))
+    if top not in SCALED_TO or len(np.unique(mask[mask > 1])) < FEWEST_STEPS:
+        return 0.5
+    return 0.5 * top if np.mean(mask[mask > 0] > NEAR_TOP * top) > 0.5 else 0.5
 
 
 def save_volume(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.cut_images import field_of_view, mask_of_content
 from g3r.acquisition.file_axes import between
 from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.acquisition.psf import psf_variance_mm2
@@ -17,6 +18,8 @@ from g3r.geometry import RigidPose
 from g3r.geometry.grid import bounding_box
 from g3r.geometry.rigid import orthonormal
 
+HALF_A_PIXEL = np.array([-0.5, 0.5])
+
 MIN_SLICE_PIXELS = 12
 """Fewest masked pixels of a slice. Slices with fewer determine no pose and show little; they are skipped and named in
 run.json. Slices without a positive masked pixel are skipped, too: they were not acquired, or were blanked."""
@@ -25,7 +28,8 @@ run.json. Slices without a positive masked pixel are skipped, too: they were not
 def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
     """Cut stacks into slices, each cropped to the bounding box of its mask.
 
-    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels, or that are blank inside it, are skipped.
+    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels, or that are blank inside it, are skipped. Zeros around
+    what brain extraction left, and zeros that pad a field of view, were not acquired (`acquisition.cut_images`).
 
     Raises:
         InputError: no stack, or none with a usable slice.
@@ -39,10 +43,11 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
         frame = orthonormal(stack.grid.plane_frame[None])[0]
         step_mm = stack.spacing_mm[2] * np.sign(frame[:, 2] @ stack.grid.axes[:, 2])
-        used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
+        mask, acquired = mask_of_content(stack), np.array(field_of_view(stack))
+        used = np.flatnonzero((mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
         n_beyond = _slices_beyond(stack, used)
         for k in used:
-            inside = stack.mask[:, :, k]
+            inside = mask[:, :, k]
             box = bounding_box(inside)
             middle = [(axis.start + axis.stop - 1) / 2 for axis in box] + [k]
             rotation.append(frame)
@@ -55,7 +60,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             stack_id.append(number)
             slice_index.append(k)
             thickness.append(stack.thickness_mm)
-            whole = np.array([(-0.5, n - 0.5) for n in inside.shape]) - np.array(middle[:2])[:, None]
+            whole = acquired + HALF_A_PIXEL - np.array(middle[:2])[:, None]
             extent.append(whole * stack.spacing_mm[:2, None])
             slice_spacing.append(step_mm)
             beyond.append([n_beyond[0] if k == used[0] else 0, n_beyond[1] if k == used[-1] else 0])

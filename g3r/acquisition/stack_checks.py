@@ -20,6 +20,9 @@ SPACING_RANGE_MM = (0.05, 50.0)
 INTENSITY_RANGE = (1e-30, 1e30)
 """Allowed range of the largest value inside a mask, so that float32 can be divided by it."""
 
+MAX_NEGATIVE_SHARE = 0.1
+"""Largest share of masked values that may be negative: filters leave a few, a mean of zero half of all."""
+
 MIN_POSITIVE_SHARE = 0.01
 """Smallest share of masked values that must be positive: intensities are normalised by their 99th percentile."""
 
@@ -85,6 +88,13 @@ def check_intensities(image: NDArray[np.float32], mask: NDArray[np.bool_], name:
         raise InputError(
             f"{name}: hardly a value inside the mask is positive (the largest is {inside.max():g}); expected a "
             "magnitude image"
+        )
+    acquired = image[mask & ((image > 0) & mask).any((0, 1))]  # a blank slice may be of a negative value
+    negative = np.count_nonzero(acquired < 0) / max(acquired.size, 1)
+    if negative > MAX_NEGATIVE_SHARE:
+        raise InputError(
+            f"{name}: {100 * negative:.0f} % of the values inside the mask are negative; expected a magnitude image, "
+            "pass it as it was before its mean was subtracted"
         )
     low, high = INTENSITY_RANGE
     if not low <= inside.max() <= high:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
+from g3r.acquisition.cut_images import cut_at_mask
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
@@ -80,7 +81,8 @@ def _outside(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Mean of unmasked pixels beside the brain [I, J, K], and where it is known."""
     none = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, bool)
-    index = np.flatnonzero(~slices.mask)
+    measured = ~cut_at_mask(slices)[slices.planes.plane_id()]
+    index = np.flatnonzero(~slices.mask & measured)
     if not len(index):
         return none
     index = index[VoxelOperator(slices.planes, grid, index, NODES).forward(inside) < OUTSIDE_SHARE]

@@ -68,16 +68,22 @@ def find_masks(
         masks[n] = found
         found_ml[n] = volume.grid.volume_ml(found.inside)
         logger.info("%s: mask: %s, %.0f ml (%s)", volume.name, found.source, found_ml[n], found.detail)
-    for n in _odd_ones(masks, found_ml):
+    guessed_ml = {n: ml for n, ml in found_ml.items() if _is_guessed(masks[n])}
+    for n in _odd_ones(masks, guessed_ml):
         left_out.append(
             f"{volumes[n].name}: left out, what was found in it ({found_ml[n]:.0f} ml) is not as large as in the "
-            f"other stacks ({', '.join(f'{ml:.0f}' for m, ml in found_ml.items() if m != n)} ml)"
+            f"other stacks ({', '.join(f'{ml:.0f}' for m, ml in guessed_ml.items() if m != n)} ml)"
         )
         del masks[n]
     if not masks:
         raise InputError(f"no brain was found in any stack ({'; '.join(left_out)}); {WAYS_ON}")
     kept = sorted(masks)
     return MaskedStacks(kept=kept, masks=[masks[n] for n in kept], left_out=left_out)
+
+
+def _is_guessed(mask: object) -> bool:
+    """Whether a network or a command found the mask; an image without background, or the user's word, is certain."""
+    return isinstance(mask, FoundMask) and mask.source in ("automatic", "command")
 
 
 def _odd_ones(masks: dict[int, str | os.PathLike[str] | FoundMask], found_ml: dict[int, float]) -> list[int]:

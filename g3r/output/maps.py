@@ -17,7 +17,6 @@ from g3r.planning.stages import Stage, stage_rng
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
-from g3r.uncertainty.estimate import prior_share_summary
 from g3r.uncertainty.prior_share import estimate_prior_share
 
 
@@ -60,11 +59,14 @@ def estimate_maps(
     if settings.use_prior:
         with run.timed(Stage.PRIOR_SHARE):
             prior_share = _mixed_share(written, fit, found, settings)
+            if written.correction is not None:
+                kept = on_grid(written.correction.kept, found.prior.volumes.grid, written.grid, outside=1.0)
+                prior_share = np.where(written.unseen, 1, prior_share * kept)
             release_memory()
     with run.timed(Stage.UNCERTAINTY):
         estimated = estimate_uncertainty(
             UncertaintyInputs(
-                volume=written.mixed,  # errors are calibrated on it; the correction lowers them a little
+                volume=written.volume,
                 mask=shown,
                 grid=written.grid,
                 fit=fit,
@@ -78,12 +80,7 @@ def estimate_maps(
             intensity=found.intensity,
             reliable=reliable,
         )
-    record = estimated.record
-    if written.correction is not None and prior_share is not None:
-        kept = on_grid(written.correction.kept, found.prior.volumes.grid, written.grid, outside=1.0)
-        prior_share = np.where(written.unseen, 1, prior_share * kept)
-        record = record | {"prior_share": prior_share_summary(prior_share[shown])}
-    return VolumeMaps(uncertainty=estimated.expected_error, prior_share=prior_share, record=record)
+    return VolumeMaps(uncertainty=estimated.expected_error, prior_share=prior_share, record=estimated.record)
 
 
 def _mixed_share(

@@ -33,7 +33,6 @@ class WrittenVolume:
 
     Attributes:
         volume: float32 [I, J, K].
-        mixed: float32 [I, J, K], the same before the correction by the slices.
         mask: bool [I, J, K], brain mask.
         support: bool [I, J, K], where the volume is shown.
         edge: float16 [I, J, K], factor by which the support fades.
@@ -47,7 +46,6 @@ class WrittenVolume:
     """
 
     volume: NDArray[np.float32]
-    mixed: NDArray[np.float32]
     mask: NDArray[np.bool_]
     support: NDArray[np.bool_]
     edge: NDArray[np.float16]
@@ -95,19 +93,18 @@ def written_volume(
     if check is not None and check.falls_back:
         mixture = replace(mixture, least_weight=1.0)
         volume = mixture.volume(cloud, grid)
-    mixed, correction = volume, corrected(volume, cloud, mixture, found, settings, run)
+    correction = corrected(volume, cloud, mixture, found, settings, run)
     if correction is not None:
         mixture = replace(mixture, correction=correction.values)
-        volume = mixture.corrected(mixed, grid)
+        volume = mixture.corrected(volume, grid)
     shown = shown_by_slices(volume, mixture, found, fit)
     if shown is not None:
         mixture = replace(mixture, edge=(edge * shown).astype(edge.dtype))
         before, after = edge.astype(np.float32), mixture.edge.astype(np.float32)
         left = np.divide(after, before, out=np.zeros_like(volume), where=before > 0)
-        volume, mixed = volume * left, mixed * left
+        volume = volume * left
     return WrittenVolume(
         volume=volume,
-        mixed=mixed,
         mask=mask,
         support=support,
         edge=mixture.edge,

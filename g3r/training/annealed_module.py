@@ -132,12 +132,12 @@ class AnnealedModule(LightningModule):
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Note when the data arrived, and seed the step's own random numbers.
 
-        The seed depends only on the run's seed and the number of the step, so that a killed run that is resumed from a
-        checkpoint draws the numbers that it would have drawn.
+        The seed depends only on the run's seed, the number of the step and that of the device, so that a killed run
+        that is resumed from a checkpoint draws the numbers that it would have drawn.
         """
         self._throughput.start_batch()
         run_seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
-        seed = np.random.SeedSequence([run_seed, self.global_step]).generate_state(1, np.uint64)[0]
+        seed = np.random.SeedSequence([run_seed, self.global_step, self.global_rank]).generate_state(1, np.uint64)[0]
         torch.manual_seed(int(seed >> np.uint64(1)))
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:

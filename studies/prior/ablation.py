@@ -27,9 +27,9 @@ VOLUMES = (
     "spina-bifida/sb31-operated",
     "spina-bifida/sb33-operated",
 )
-"""Volumes that were not used for training. Weeks 24, 30 and 34 were used for nothing at all, but neighbouring weeks
-were trained on. The operated volumes belong to another atlas, whose volumes before operation were trained on;
-checkpoints were chosen on operated volumes."""
+"""Volumes that were not used for training. No network was trained on weeks 24, 30 and 34, but on their neighbours, and
+other simulations of them were looked at. The operated volumes belong to another atlas, whose volumes before operation
+were trained on; checkpoints were chosen on operated volumes."""
 
 GROUPS = {"sta": "crl-sta/", "sb": "spina-bifida/"}
 

@@ -21,8 +21,8 @@ from studies.tradeoff.presets_figure import draw_presets
 FIRST_SEED = 64_000
 
 HEADS = ("crl-sta/sta24", "crl-sta/sta34", "spina-bifida/sb33-operated", "spina-bifida/sb34-operated")
-"""Heads that were neither trained on nor looked at when settings were chosen. Weeks next to those of the `sta` heads
-are in the training data."""
+"""Heads that no network was trained on. Weeks next to those of the `sta` heads are in the training data. What was
+looked at when settings were chosen is in docs/tradeoff.md."""
 
 SIZES = ((0.7, 3.0, 0.0), (1.0, 2.5, 0.0), (1.1, 3.0, 0.3), (1.3, 4.0, 0.0))
 """Pixel size, slice thickness and gap in mm."""

@@ -84,7 +84,7 @@ CHECK_SUBJECTS = [
     _subject("crl-sta/sta34", 3, "mild", 52_208),
     _subject("crl-sta/sta30", 1, "mild", 52_219, Hole(0, 0.6, n_slices=2)),
 ]
-"""Subjects of the check: weeks excluded from every training and choice."""
+"""Subjects of the check: weeks that no network was trained on. Other simulations of them were looked at."""
 
 UNREGISTERED = _subject("crl-sta/sta30", 3, "moderate", 52_260)
 """Additional subject of the check, reconstructed from the headers without registration, to see whether the uncertainty

@@ -149,3 +149,18 @@ def test_an_empty_mask_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "m.nii.gz", np.zeros(mask.shape, np.uint8), reference.affine)
     with pytest.raises(InputError, match=r"m\.nii\.gz: mask is empty"):
         load_mask(path, reference)
+
+
+@pytest.mark.parametrize("top", [100, 255])
+def test_a_probability_in_whole_numbers_is_cut_at_its_half(tmp_path: Path, top: int) -> None:
+    image, _ = arrays()
+    reference = load_volume(write(tmp_path / "a.nii.gz", image, np.eye(4)))
+    place = np.linspace(-8, 4, image.size).reshape(image.shape)
+    probability = 1 / (1 + np.exp(-4 * place))
+    scaled = np.rint(np.where(place > 1.5, 1, probability) * top).astype(np.uint8)
+    found = load_mask(write(tmp_path / "m.nii.gz", scaled, np.eye(4)), reference)
+    np.testing.assert_array_equal(found, scaled > top / 2)
+    # labels that reach the same number are brain from 1 on
+    labels = np.where(place > 0, 1 + np.arange(image.size).reshape(image.shape) % 60, 0).astype(np.uint8)
+    labels.ravel()[-1] = top
+    np.testing.assert_array_equal(load_mask(write(tmp_path / "l.nii.gz", labels, np.eye(4)), reference), labels > 0)

@@ -115,3 +115,12 @@ def test_unusable_stacks_are_refused(change: dict[str, Any], message: str) -> No
     with pytest.raises(InputError, match=message) as caught:
         Stack(**(good | change))
     assert str(caught.value).startswith("a.nii: ")
+
+
+def test_an_image_without_its_mean_is_refused(tmp_path: Path) -> None:
+    image, mask = arrays()
+    shifted = image - image[mask > 0].mean()
+    affine = affine_of(AXES["RAS"])
+    paths = write(tmp_path / "a.nii.gz", shifted, affine), write(tmp_path / "m.nii.gz", mask.astype(np.uint8), affine)
+    with pytest.raises(InputError, match=r"a\.nii\.gz: \d+ % of the values inside the mask are negative"):
+        load_stack(*paths, 2.5)

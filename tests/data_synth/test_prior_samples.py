@@ -122,7 +122,7 @@ def test_training_takes_a_template_of_another_age_and_validation_the_nearest() -
         assert all(near <= abs(one - weeks) <= far for one in found)
     assert ages(23.0, in_order=True) <= {22.0, 25.0}
     assert ages(33.0, in_order=True) == {34.0}
-    # without another age in range, the nearest one is taken
+    # where all are further away, the nearest one is taken
     assert ages(50.0, in_order=False) == {float(template().weeks[-1])}
 
 

@@ -9,7 +9,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from g3r.acquisition.brain_mask import FoundMask
+from g3r.acquisition.brain_mask import FoundMask, MaskSource
 from g3r.acquisition.images import Volume
 from g3r.cli.infer_task import _load
 from g3r.errors import InputError
@@ -30,12 +30,17 @@ def write(folder: Path, name: str, around: float = 1.0) -> Path:
     return folder / name
 
 
-def find(paths: list[Path], masks: dict[str, np.ndarray | str], given: list[Path | None] | None = None) -> MaskedStacks:
+def find(
+    paths: list[Path],
+    masks: dict[str, np.ndarray | str],
+    given: list[Path | None] | None = None,
+    source: MaskSource = "automatic",
+) -> MaskedStacks:
     """Find masks with a mask command that looks them up by the name of the stack."""
 
     def masker(path: object, volume: Volume) -> FoundMask | str:
         found = masks[volume.name]
-        return found if isinstance(found, str) else FoundMask(inside=found, source="automatic")
+        return found if isinstance(found, str) else FoundMask(inside=found, source=source)
 
     return find_masks(paths, given, masker)
 
@@ -89,6 +94,11 @@ def test_a_mask_of_another_size_than_all_others_is_left_out(three: list[Path]) -
         found = find(three, {"a.nii": ball(9), "b.nii": odd, "c.nii": ball(8.5)})
         assert found.kept == [0, 2]
         assert found.left_out[0].startswith("b.nii: left out, what was found in it")
+
+
+def test_a_mask_that_is_certain_may_have_any_size(three: list[Path]) -> None:
+    masks: dict[str, np.ndarray | str] = {"a.nii": ball(9), "b.nii": ball(5), "c.nii": ball(8.5)}
+    assert find(three, masks, source="whole image").kept == [0, 1, 2]
 
 
 def test_a_head_that_the_field_of_view_cuts_is_smaller_by_right(three: list[Path]) -> None:
