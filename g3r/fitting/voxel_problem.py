@@ -140,6 +140,9 @@ class VoxelProblem:
         pixels: to be explained.
         grid: of the volumes.
         settings: hold, strength of total variation, and how long.
+
+    Attributes:
+        pixels_per_voxel: mean coverage of a voxel that pixels show, r.
     """
 
     def __init__(self, pixels: FitPixels, grid: VolumeGrid, settings: VoxelProblemSettings) -> None:
@@ -147,6 +150,7 @@ class VoxelProblem:
         self.operator = pixels.operator(grid)
         seen = self.operator.adjoint(pixels.weight)
         typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0
+        self.pixels_per_voxel = typical
         self.hold, self.strength = (np.float32(typical * one) for one in (settings.hold, settings.total_variation))
 
     def solved(self, volume: Float32Array) -> Float32Array:
