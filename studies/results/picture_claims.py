@@ -8,7 +8,7 @@ from dataclasses import replace
 from statistics import mean
 
 from studies.results.blocks import Block, TableRow, number
-from studies.results.findings import FEW, Claim, Finding, column, paired, shares, value
+from studies.results.findings import FEW, Claim, Finding, column, paired, shares, table_after, value
 
 MIN_DICE = 0.92
 """Required Dice coefficient with hand-drawn masks of real stacks."""
@@ -116,7 +116,7 @@ def cost_of_masks(beside: str) -> Claim:
 
 
 def fill(first: str, second: str, text: str) -> Claim:
-    """Claim about the gain of one fill of the unseen part over another.
+    """Claim about the gain of one fill of the unseen part over another, where fills differ.
 
     Args:
         first: name of the better fill.
@@ -125,12 +125,16 @@ def fill(first: str, second: str, text: str) -> Claim:
     """
 
     def find(block: Block) -> Finding | None:
-        n = re.search(r"(\d+) with an unseen part", block.text)
-        one, other = (value(block.tables[0].row(name), "unseen part, dB") for name in (first, second))
-        if n is None or one is None or other is None:
+        table = table_after(block, "Every subject")
+        gains = [
+            (value(row, f"{first}, unseen dB") or 0.0) - (value(row, f"{second}, unseen dB") or 0.0)
+            for row in (table.rows if table else ())
+            if len({row[f"{name}, unseen dB"] for name in ("nothing", "harmonic", "template")}) > 1
+        ]
+        if not gains:
             return None
-        holds, enough = one > other, int(n[1]) >= FEW
-        return Finding(figure=f"{one - other:+.2f} dB", n=int(n[1]), of="subjects", holds=holds, enough=enough)
+        gain, enough = mean(gains), len(gains) >= FEW
+        return Finding(figure=f"{gain:+.2f} dB", n=len(gains), of="subjects", holds=gain > 0, enough=enough)
 
     return Claim(
         text=text,
