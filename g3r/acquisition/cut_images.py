@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_fill_holes
 
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.stacks import Stack
 from g3r.geometry.grid import bounding_box
 
 MOSTLY = 0.9
@@ -47,27 +46,30 @@ def _beside_mask(slices: Slices, k: int) -> NDArray[np.float32]:
     return np.asarray(value[binary_dilation(mask) & ~mask])
 
 
-def mask_of_content(stack: Stack) -> NDArray[np.bool_]:
+def mask_of_content(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The mask [I, J, K] without the zeros around an image that was cut out more narrowly than its mask.
 
     Zeros that content surrounds stay, and so do slices that are zero throughout.
     """
-    zero = (stack.image == 0) & stack.mask
-    if zero.sum() <= FEW * stack.mask.sum():
-        return stack.mask
-    mask = stack.mask.copy()
-    for k in np.flatnonzero((stack.mask & ~zero).any((0, 1))):
-        mask[:, :, k] &= binary_fill_holes(stack.image[:, :, k] != 0)
-    return mask
+    zero = (image == 0) & mask
+    if zero.sum() <= FEW * mask.sum():
+        return mask
+    found = mask.copy()
+    for k in np.flatnonzero((mask & ~zero).any((0, 1))):
+        found[:, :, k] &= binary_fill_holes(image[:, :, k] != 0)
+    return found
 
 
-def field_of_view(stack: Stack) -> tuple[tuple[int, int], tuple[int, int]]:
+def field_of_view(image: NDArray[np.float32]) -> tuple[tuple[int, int], tuple[int, int]]:
     """First and last index, along both axes of a slice, of the pixels that were acquired.
 
     All of them, unless zeros pad a rectangle of pixels that mostly are not zero.
+
+    Args:
+        image: [I, J, K] slices along the third axis.
     """
-    whole = tuple((0, n - 1) for n in stack.image.shape[:2])
-    content = stack.image != 0
+    whole = tuple((0, n - 1) for n in image.shape[:2])
+    content = image != 0
     seen = content.any(2)
     if not seen.any():
         return whole[0], whole[1]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.cut_images import field_of_view, mask_of_content
+from g3r.acquisition.cut_images import field_of_view
 from g3r.acquisition.file_axes import between
 from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.acquisition.psf import psf_variance_mm2
@@ -28,8 +28,8 @@ run.json. Slices without a positive masked pixel are skipped, too: they were not
 def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
     """Cut stacks into slices, each cropped to the bounding box of its mask.
 
-    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels, or that are blank inside it, are skipped. Zeros around
-    what brain extraction left, and zeros that pad a field of view, were not acquired (`acquisition.cut_images`).
+    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels, or that are blank inside it, are skipped. Zeros
+    that pad a field of view were not acquired (`acquisition.cut_images`).
 
     Raises:
         InputError: no stack, or none with a usable slice.
@@ -43,11 +43,11 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
         frame = orthonormal(stack.grid.plane_frame[None])[0]
         step_mm = stack.spacing_mm[2] * np.sign(frame[:, 2] @ stack.grid.axes[:, 2])
-        mask, acquired = mask_of_content(stack), np.array(field_of_view(stack))
-        used = np.flatnonzero((mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
+        acquired = np.array(field_of_view(stack.image))
+        used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
         n_beyond = _slices_beyond(stack, used)
         for k in used:
-            inside = mask[:, :, k]
+            inside = stack.mask[:, :, k]
             box = bounding_box(inside)
             middle = [(axis.start + axis.stop - 1) / 2 for axis in box] + [k]
             rotation.append(frame)

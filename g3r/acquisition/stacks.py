@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
+from g3r.acquisition.cut_images import mask_of_content
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
@@ -125,7 +126,8 @@ def load_stack(
 
     The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third. Image, mask and
     affine are turned together so that it becomes the last axis and rows have one order (`FileAxes`). Slices keep their
-    numbers. The affine is rounded; no point within 120 mm of the middle moves by more than 0.02 mm (`settled`).
+    numbers. Zeros around an extracted brain are no part of a mask (`mask_of_content`). The affine is rounded; no point
+    within 120 mm of the middle moves by more than 0.02 mm (`settled`).
 
     Args:
         path: of the NIfTI image.
@@ -161,9 +163,10 @@ def load_stack(
         remarks.append(f"thickness {profile.thickness_mm:g} mm is less than the pixels' {pixels} mm; check --thickness")
     for remark in remarks:
         logger.warning("%s: %s", volume.name, remark)
+    image, inside = axes.from_file(volume.data), axes.from_file(found.inside)
     return Stack(
-        image=axes.from_file(volume.data),
-        mask=axes.from_file(found.inside),
+        image=image,
+        mask=mask_of_content(image, inside),
         affine=grid.affine,
         thickness_mm=profile.thickness_mm,
         name=volume.name,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from g3r.acquisition.cut_images import cut_at_mask, field_of_view, mask_of_content
 from g3r.acquisition.slicing import slices_from_stacks
-from g3r.acquisition.stacks import Stack
+from g3r.acquisition.stacks import Stack, load_stack
+from tests.acquisition.nifti_files import write
 from tests.gaussians.scenes import slices_of, stack_planes
 
 
@@ -39,25 +41,28 @@ def brain(within: float, **rest: float) -> np.ndarray:
     return np.where(within > RADIUS, image, rest.get("beyond", 0.0)).astype(np.float32)
 
 
-def test_zeros_around_an_extracted_brain_leave_a_wide_mask() -> None:
+def test_zeros_around_an_extracted_brain_leave_a_wide_mask(tmp_path: Path) -> None:
     image, wide = brain(5.0), RADIUS < 9
     image[9:11, 9:11, 2] = 0  # a dark spot in the brain
     image[:, :, 4] = 0  # a blank slice
-    found = mask_of_content(stack_of(image, wide))
+    found = mask_of_content(image, wide)
     expected = RADIUS < 5
     expected[:, :, 4] = wide[:, :, 4]
     np.testing.assert_array_equal(found, expected)
     # noise around it: the mask holds
-    np.testing.assert_array_equal(mask_of_content(stack_of(brain(5.0, beyond=3.0), wide)), wide)
-    assert slices_from_stacks([stack_of(image, wide)]).mask.sum() == expected[:, :, :4].sum() + expected[:, :, 5].sum()
+    np.testing.assert_array_equal(mask_of_content(brain(5.0, beyond=3.0), wide), wide)
+    # of files; an array's mask is as it is given
+    affine = np.diag([1.0, 1.0, 3.0, 1.0])
+    paths = write(tmp_path / "a.nii.gz", image, affine), write(tmp_path / "m.nii.gz", wide.astype(np.uint8), affine)
+    np.testing.assert_array_equal(load_stack(*paths, 3.0).mask, expected)
 
 
 def test_a_padded_field_of_view_ends_where_zeros_begin() -> None:
     image = brain(100.0)
-    assert field_of_view(stack_of(image, RADIUS < 5)) == ((0, 19), (0, 19))
+    assert field_of_view(image) == ((0, 19), (0, 19))
     image[:4] = image[:, 18:] = 0
-    assert field_of_view(stack_of(image, RADIUS < 5)) == ((4, 19), (0, 17))
+    assert field_of_view(image) == ((4, 19), (0, 17))
     extent = slices_from_stacks([stack_of(image, RADIUS < 5)]).fields_of_view.extent_mm
     np.testing.assert_allclose(extent, np.broadcast_to([[-6.0, 10.0], [-10.0, 8.0]], extent.shape))
     # an extracted brain is no rectangle, and nothing says where its field of view ended
-    assert field_of_view(stack_of(brain(7.0), RADIUS < 5)) == ((0, 19), (0, 19))
+    assert field_of_view(brain(7.0)) == ((0, 19), (0, 19))

@@ -47,10 +47,11 @@ def stacks(draw: st.DrawFn) -> Stack:
     affine[:3, 3] = draw(st.tuples(*[st.floats(-1e4, 1e4)] * 3))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     scale = 10.0 ** draw(st.integers(-6, 6))
-    data = (rng.normal(size=shape) * scale + draw(st.floats(0, 3)) * scale).astype(np.float32)
+    data = ((np.abs(rng.normal(size=shape)) + draw(st.floats(0, 3))) * scale).astype(np.float32)
     data.flat[0] = scale  # at least one positive value
+    data.flat[-1] = -scale  # and a negative one beside the brain
     mask = rng.random(shape) < draw(st.floats(0.2, 1.0))
-    mask.flat[:2] = True
+    mask.flat[:2], mask.flat[-1] = True, False
     return Stack(image=data, mask=mask, affine=affine, thickness_mm=draw(st.floats(0.1, 20.0)), name="any")
 
 
