@@ -63,9 +63,10 @@ def measure(folder: Path, seed: int, options: argparse.Namespace) -> Row:
     }
     reconstructor = GaussianReconstructor(settings=options.preset)
     drawn = [replace(stack, mask=as_people_draw(stack.mask, stack.spacing_mm)) for stack in stacks]
-    ways = dict(zip(WAYS, (stacks, drawn, [stack for stack in found if stack is not None]), strict=True))
-    for name, masked in ways.items():
-        row |= {f"{name}_{key}": value for key, value in _scores(case, reconstructor, masked).items()} if masked else {}
+    ways: tuple[Sequence[Stack | None], ...] = (stacks, drawn, found)
+    for name, masked in zip(WAYS, ways, strict=True):
+        if any(stack is not None for stack in masked):
+            row |= {f"{name}_{key}": value for key, value in _scores(case, reconstructor, masked).items()}
     return row
 
 
@@ -86,9 +87,14 @@ def _masked(stack: Stack, source: str | None) -> Stack | None:
     return replace(stack, mask=found.mask, mask_source="automatic") if found.found else None
 
 
-def _scores(case: SimulatedCase, reconstructor: GaussianReconstructor, stacks: Sequence[Stack]) -> dict[str, float]:
-    result = reconstructor.reconstruct(stacks)
-    slices = replace(result.slices, slice_index=result.slices.slice_index - SLICES_BEYOND)
+def _scores(
+    case: SimulatedCase, reconstructor: GaussianReconstructor, stacks: Sequence[Stack | None]
+) -> dict[str, float]:
+    """Scores of the volume of the stacks that have a mask."""
+    numbers = np.array([n for n, stack in enumerate(stacks) if stack is not None])
+    result = reconstructor.reconstruct([stack for stack in stacks if stack is not None])
+    stack_id, slice_index = numbers[result.slices.stack_id], result.slices.slice_index - SLICES_BEYOND
+    slices = replace(result.slices, stack_id=stack_id, slice_index=slice_index)
     error = case.pose_error(slices)
     depth_mm = distance_transform_edt(case.truth_mask, sampling=case.truth.grid.spacing_mm)
     volume = Volume(result.volume, result.grid.moved(error.common).affine, case.name)
