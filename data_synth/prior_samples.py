@@ -142,17 +142,18 @@ class SyntheticSubjects(SubjectDataset[Patches]):
     def _template_head(self, weeks: float, rng: np.random.Generator) -> PlacedHead:
         """The template to fit: nearest in age for validation, and of another age for training.
 
-        Where all are nearer than `OTHER_AGE_WEEKS` asks for, it is the furthest: the nearest may be a mean of few heads
-        with the subject among them, and the network would learn to trust it.
+        Where none is as far away as `OTHER_AGE_WEEKS` asks for, it is the nearest beyond, or else the furthest of all:
+        nearer ones may be means of few heads with the subject among them, and the network would learn to trust them.
         """
         apart = np.abs(self.template.weeks - weeks)
         nearest, furthest = OTHER_AGE_WEEKS
         others = np.flatnonzero((apart >= nearest) & (apart <= furthest))
         if self.in_order:
             return self.template.head(int(apart.argmin()))
-        if not len(others):
-            others = np.array([apart.argmin() if apart.min() > furthest else apart.argmax()])
-        return self.template.head(int(rng.choice(others)))
+        if len(others):
+            return self.template.head(int(rng.choice(others)))
+        beyond = np.where(apart > furthest, apart, np.inf)
+        return self.template.head(int(beyond.argmin() if np.isfinite(beyond).any() else apart.argmax()))
 
 
 def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int]) -> list[NDArray[np.int64]]:

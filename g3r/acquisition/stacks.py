@@ -164,9 +164,13 @@ def load_stack(
     for remark in remarks:
         logger.warning("%s: %s", volume.name, remark)
     image, inside = axes.from_file(volume.data), axes.from_file(found.inside)
+    mask_shown = mask_of_content(image, inside)
+    if n_zero := np.count_nonzero(inside) - np.count_nonzero(mask_shown):
+        share = n_zero / np.count_nonzero(inside)
+        logger.info("%s: zeros around the brain are left out of its mask (%.0f %% of it)", volume.name, 100 * share)
     return Stack(
         image=image,
-        mask=mask_of_content(image, inside),
+        mask=mask_shown,
         affine=grid.affine,
         thickness_mm=profile.thickness_mm,
         name=volume.name,

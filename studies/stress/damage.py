@@ -50,6 +50,15 @@ def masks_grown(pixels: int) -> Damage:
     return Damage(lambda stacks, other, rng: tuple(map(grown, stacks)))
 
 
+def images_cut() -> Damage:
+    """Set images to zero beyond their masks, as brain extraction does, in all stacks."""
+
+    def cut(stack: Stack) -> Stack:
+        return replace(stack, image=np.where(stack.mask, stack.image, np.float32(0)))
+
+    return Damage(lambda stacks, other, rng: tuple(map(cut, stacks)))
+
+
 def slices_lost(share: float) -> Damage:
     """Remove the masks of random slices in all stacks."""
 

@@ -1,6 +1,7 @@
 """Training subjects of the prior network: their values and reproducibility."""
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +123,12 @@ def test_training_takes_a_template_of_another_age_and_validation_the_nearest() -
         assert all(near <= abs(one - weeks) <= far for one in found)
     assert ages(23.0, in_order=True) <= {22.0, 25.0}
     assert ages(33.0, in_order=True) == {34.0}
-    # where all are further away, the nearest one is taken
+    # where all others are further away, the nearest of these is taken, and where all are nearer, the furthest
     assert ages(50.0, in_order=False) == {float(template().weeks[-1])}
+    assert ages(23.0, in_order=False) == {31.0}
+    near_ones = replace(template(), weeks=np.array([27.0, 28.0, 29.0, 30.0]))
+    dataset = SyntheticSubjects(SUBJECTS, near_ones, spacing_mm=SPACING_MM, length=4, seed=7, patch_size=30)
+    assert np.array_equal(dataset._template_head(28.5, rng).volume, near_ones.volume[0])
 
 
 FIGURES = {

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.voxel_correction import (
     CLEARLY,
+    FINEST_ACQUIRED_MM,
     LESS_HELD,
     LOOSE,
     TIGHT,
@@ -97,6 +98,15 @@ def test_few_stacks_and_fixed_settings_are_not_asked(n_stacks: int, loosens: boo
     record = corrected(SOFT, noisy_fit(1, n_stacks), replace(TIGHT, loosens=loosens))
     assert record.loose_error is None
     assert record.hold >= TIGHT.hold
+
+
+def test_few_pixels_and_interpolated_ones_are_not_asked() -> None:
+    fit = noisy_fit(1)
+    few = np.where(np.arange(len(fit.slices.value)) % 8 == 0, fit.slices.mask, False)
+    assert corrected(SOFT, replace(fit, slices=replace(fit.slices, mask=few))).loose_error is None
+    planes = fit.slices.planes
+    fine = replace(planes, spacing_mm=0.9 * FINEST_ACQUIRED_MM * np.ones_like(planes.spacing_mm))
+    assert corrected(SOFT, replace(fit, slices=replace(fit.slices, planes=fine))).loose_error is None
 
 
 def test_other_settings_hold_as_they_are_where_the_volume_is_good() -> None:

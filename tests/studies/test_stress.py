@@ -41,6 +41,12 @@ def test_fewer_stacks_slices_and_pixels(stacks: tuple[Stack, ...]) -> None:
             assert large.mask.sum() > small.mask.sum()
 
 
+def test_images_are_cut_where_their_masks_end(stacks: tuple[Stack, ...]) -> None:
+    for old, new in zip(stacks, after(damage.images_cut(), stacks), strict=True):
+        assert (new.image[~old.mask] == 0).all()
+        np.testing.assert_array_equal(new.image[old.mask], old.image[old.mask])
+
+
 def test_headers_and_single_stacks(stacks: tuple[Stack, ...]) -> None:
     assert [one.thickness_mm for one in after(damage.stated_thickness(0.7), stacks)] == pytest.approx([2.8] * 3)
     first, second, last = after(damage.slices_reversed(), stacks)

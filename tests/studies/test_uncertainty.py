@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from g3r.evaluation.case import load_case
+from g3r.fitting.voxel_correction import VoxelCorrectionSettings
+from g3r.planning.presets import PRESETS
+from g3r.reconstruct import GaussianReconstructor
 from g3r.uncertainty.error_model import ErrorModel
-from studies.uncertainty.data import CHECK_SUBJECTS, FIT_SUBJECTS, relative_error
+from g3r.uncertainty.estimate import calibration
+from studies.uncertainty.data import CHECK_SUBJECTS, FIT_SUBJECTS, predictors_of, relative_error
 from studies.uncertainty.figure import draw_calibration
 from studies.uncertainty.judgement import EXPONENTIAL_COVERAGE, check_record, check_text, judge
 
@@ -113,3 +119,13 @@ def test_record_table_and_figure(tmp_path: Path) -> None:
     assert "+ 1.00 log residual" in text
     draw_calibration(record, tmp_path / "new" / "figure.png")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["figure.png"]
+
+
+def test_the_map_of_a_run_is_made_of_what_it_was_calibrated_on(subject: Path) -> None:
+    """The correction on voxels changes the volume and the prior share, which both are predictors."""
+    settings = replace(PRESETS["fast"], voxel_correction=VoxelCorrectionSettings(), resolution_mm=1.5)
+    result = GaussianReconstructor(settings=settings).reconstruct(load_case(subject, 4.0).stacks)
+    assert result.record.voxel_correction is not None
+    assert result.uncertainty is not None
+    expected = calibration()["with prior"].expected(predictors_of(result)) * result.intensity_scale
+    np.testing.assert_allclose(result.uncertainty[result.mask], expected, rtol=0.01)
