@@ -12,8 +12,9 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.common_bias_field import common_log_field, without_field
 from g3r.acquisition.coverage import brain_share
-from g3r.acquisition.foreground import Foreground, Votes
+from g3r.acquisition.foreground import Foreground
 from g3r.acquisition.least_squares import sharpened_volume
+from g3r.acquisition.mask_votes import Votes
 from g3r.acquisition.planes import Slices
 from g3r.geometry import VolumeGrid
 

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.orientations import mean_normals
 from g3r.acquisition.planes import Slices
 from g3r.fitting.parameters import FitParameters
-from g3r.registration.open_strain import mean_normals, open_strain
+from g3r.registration.open_strain import open_strain
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.bias_basis import N_TERMS
+from g3r.acquisition.orientations import mean_normals
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.objective import TermLoss
@@ -14,7 +15,7 @@ from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.geometry.rigid import right_jacobian
-from g3r.registration.open_strain import mean_normals, open_strain
+from g3r.registration.open_strain import open_strain
 
 
 def slice_blocks(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.foreground import foreground
+from g3r.acquisition.mask_votes import foreground
 from g3r.errors import NumericalError
 from g3r.fitting.edge_by_image import shown_by_image
 from g3r.fitting.initial_volumes import PriorVolume

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.orientations import MIN_LENGTH, mean_normals
 from g3r.acquisition.planes import Slices
 
 MAX_CLOSED, MIN_OTHERS = 0.15, 0.5
@@ -17,16 +18,6 @@ MAX_CLOSED, MIN_OTHERS = 0.15, 0.5
 largest of an open strain, and the smallest of the next strain. The first lets further stacks be 10 degrees from one of
 two orientations; the second asks for 45 degrees between the two, since slices of one orientation leave more than one
 strain open."""
-
-MIN_LENGTH = 0.5
-"""Least length of the mean of a stack's unit normals. If it is shorter, the slices have no orientation in common, as
-those of a radial scan."""
-
-
-def mean_normals(slices: Slices) -> NDArray[np.float64]:
-    """The mean of the unit normals of each stack [n_stacks, 3]; the shorter, the more its slices are turned."""
-    normal = slices.planes.rotation[:, :, 2]
-    return np.stack([normal[slices.stack_id == stack].mean(0) for stack in np.unique(slices.stack_id)])
 
 
 def crossing_deg(slices: Slices) -> float | None:

@@ -14,9 +14,9 @@ from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.coverage import brain_share, coverage
-from g3r.acquisition.foreground import foreground
 from g3r.acquisition.images import Volume
 from g3r.acquisition.least_squares import sharpened_volume
+from g3r.acquisition.mask_votes import foreground
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.smooth_fill import smooth_fill

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from g3r.acquisition.foreground import foreground
+from g3r.acquisition.mask_votes import foreground
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.geometry import VolumeGrid

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
-from g3r.acquisition.foreground import Foreground, foreground
+from g3r.acquisition.foreground import Foreground
+from g3r.acquisition.mask_votes import foreground
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from g3r.acquisition.foreground import foreground
+from g3r.acquisition.mask_votes import foreground
 from g3r.acquisition.slicing import slices_from_stacks
 from tests.acquisition.ellipsoids import GRID, TURNS, WORLD, depth, ellipsoid_stack
 

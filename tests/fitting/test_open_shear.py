@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from g3r.acquisition.orientations import mean_normals
 from g3r.acquisition.planes import Slices
 from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
@@ -16,7 +17,7 @@ from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import RigidPose
 from g3r.geometry.quaternion import rotation_from_quaternion
-from g3r.registration.open_strain import mean_normals, open_strain
+from g3r.registration.open_strain import open_strain
 from tests.fitting.scene import fit, make_slices, true_cloud, true_volume
 from tests.gaussians.scenes import cloud_of
 

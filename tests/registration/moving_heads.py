@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
+from g3r.acquisition.orientations import mean_normals
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration import Registration
-from g3r.registration.open_strain import mean_normals, open_strain, tilts
+from g3r.registration.open_strain import open_strain, tilts
 
 STILL = MotionLevel()
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from data_synth.motion import MotionLevel, slice_trajectory
+from g3r.acquisition.orientations import mean_normals
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
 from g3r.registration.motion_shear import SHEAR_ERROR, motion_shear, without_excess_shear
-from g3r.registration.open_strain import mean_normals, open_strain
+from g3r.registration.open_strain import open_strain
 from tests.gaussians.scenes import slices_of, stack_planes
 from tests.registration.moving_heads import sheared
 
