@@ -9,6 +9,9 @@ from pathlib import Path
 
 MEGABYTE = 1e6
 
+OUT_OF_MEMORY_WORDS = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
+"""Phrases for lack of memory in messages of numpy, torch, the library loader and the system."""
+
 
 class G3RError(Exception):
     """Base of every error that g3r raises on purpose; the message is one actionable line."""
@@ -36,6 +39,16 @@ def one_line(error: BaseException) -> str:
     """The first 120 characters of an error's text, without line breaks; the name of its type if it has no text."""
     text = " ".join(str(error).split())
     return text[:120] if text else type(error).__name__
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or one of its causes, means lack of memory."""
+    while error is not None:
+        message = str(error).lower()
+        if isinstance(error, MemoryError) or any(words in message for words in OUT_OF_MEMORY_WORDS):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def cannot_be_written(path: str | os.PathLike[str], error: OSError, needed_bytes: int | None = None) -> InputError:

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 2
 
-TRAINING_ENTRY = "g3r_export"
-"""Entry of a Lightning checkpoint that holds, as plain values, the facts that an export needs besides the weights."""
-
 DAMAGED = "copy or export it again"
 
 
@@ -155,7 +152,7 @@ class TrainedModel:
         """The model from the result of a training.
 
         Args:
-            entry: the training's entry `TRAINING_ENTRY`.
+            entry: facts that the training recorded, see `TrainingCheckpoint`.
             weights: weights of the network, by name.
             training_data: its training data, in words.
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from g3r._version import __version__
 from g3r.cli.completion import parsed
-from g3r.cli.failures import INTERRUPTED, is_out_of_memory, run_command
-from g3r.errors import G3RError, InputError, one_line
+from g3r.cli.failures import INTERRUPTED, run_command
+from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.checkpoints.trained_model import TrainedModel
@@ -63,32 +62,30 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
         The written model, read back from the file.
 
     Raises:
-        InputError: `run` is missing, damaged or of another kind; `file` exists, has another ending or cannot be
-            written.
+        InputError: `run` is missing, damaged, of another kind or of other conventions, or for comparison only; `file`
+            exists, has another ending or cannot be written.
     """
-    from g3r.checkpoints.trained_model import TRAINING_ENTRY
+    from g3r.checkpoints.plain_values import shown
+    from g3r.checkpoints.training_checkpoint import read_training
     from g3r.checkpoints.weights_file import SUFFIX
 
     if file.suffix != SUFFIX:
         raise InputError(f"{file}: expected a name that ends in {SUFFIX}; choose another name")
     if file.exists() and not replace:
         raise InputError(f"{file}: exists already; pass --force to replace it, or another name")
-    content = _read_run(run, TRAINING_ENTRY)
-    try:
-        entry = content[TRAINING_ENTRY]
-        recorded = f"{entry['training_data']}; {entry['optimiser_steps']} optimiser steps"
-        words = recorded if data_description is None else data_description
-        if not all(bool(value.isfinite().all()) for value in content["state_dict"].values()):
-            raise InputError(f"{run}: the weights hold NaN or infinity; export an earlier checkpoint of the run")
-        kind = _model_types()[entry["kind"]]
-        kind.from_training(entry, _weights(content), words).save(file)
-        return kind.load(file)
-    except G3RError:
-        raise
-    except Exception as error:  # a network with unexpected values may raise anything
-        if is_out_of_memory(error):
-            raise
-        raise InputError(f"{run}: cannot be exported ({one_line(error)}); export another checkpoint") from error
+    checkpoint = read_training(run)
+    only = checkpoint.entry.get("comparison_only")
+    if only:
+        raise InputError(
+            f"{run}: was trained with {only}, for comparison only, since g3r-infer gives every network what it has "
+            "without that option; train without it, and export that run"
+        )
+    types = _model_types()
+    kind = checkpoint.entry.get("kind")
+    if kind not in types:
+        raise InputError(f"{run}: holds a network of kind {shown(kind)}; expected one of {', '.join(types)}")
+    checkpoint.model(types[kind], data_description).save(file)
+    return types[kind].load(file)
 
 
 def _model_types() -> dict[str, type[TrainedModel]]:
@@ -97,33 +94,6 @@ def _model_types() -> dict[str, type[TrainedModel]]:
     from g3r.prior.model import Prior
 
     return {Prior.kind: Prior, PoseModel.kind: PoseModel, MaskModel.kind: MaskModel}
-
-
-def _weights(content: dict[str, Any]) -> dict[str, Any]:
-    """The network's part of a training checkpoint's state."""
-    prefix = "network."
-    return {
-        name.removeprefix(prefix): value for name, value in content["state_dict"].items() if name.startswith(prefix)
-    }
-
-
-def _read_run(run: Path, entry: str) -> dict[str, Any]:
-    """Return the content of a training checkpoint, or raise `InputError` with the reason in one line."""
-    import torch
-
-    expected = "expected a training checkpoint of g3r-pretrain, such as .../checkpoints/last.ckpt"
-    try:
-        with warnings.catch_warnings(action="ignore"):  # the error message replaces torch's warnings
-            content = torch.load(run, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise InputError(f"{run}: no such file; {expected}") from error
-    except Exception as error:  # torch.load raises many types for a damaged file
-        if is_out_of_memory(error):
-            raise
-        raise InputError(f"{run}: cannot be read as a checkpoint ({type(error).__name__}); {expected}") from error
-    if not isinstance(content, dict) or "state_dict" not in content or entry not in content:
-        raise InputError(f"{run}: was not written by this version of g3r-pretrain; {expected}")
-    return content
 
 
 if __name__ == "__main__":

@@ -6,13 +6,10 @@ import errno
 import sys
 from collections.abc import Callable
 
-from g3r.errors import G3RError, InputError, NumericalError, cannot_be_written
+from g3r.errors import G3RError, InputError, NumericalError, cannot_be_written, is_out_of_memory
 
 EXPECTED = (G3RError, MemoryError, RuntimeError, ImportError, OSError)
 """Errors that `line_and_code` may handle; it raises those again that are defects of the program."""
-
-OUT_OF_MEMORY_WORDS = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
-"""Phrases for lack of memory in messages of numpy, torch, the library loader and the system."""
 
 EXTRAS = {
     "evaluate": ("skimage",),
@@ -92,13 +89,3 @@ def missing_extra(error: ModuleNotFoundError) -> str:
         if (error.name or "").split(".")[0] in packages:
             return f"{error.name} is not installed; install the {extra} extra: pip install '.[{extra}]' in a checkout"
     raise error
-
-
-def is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or one of its causes, means lack of memory."""
-    while error is not None:
-        message = str(error).lower()
-        if isinstance(error, MemoryError) or any(words in message for words in OUT_OF_MEMORY_WORDS):
-            return True
-        error = error.__cause__ or error.__context__
-    return False

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from g3r._version import __version__
-from g3r.cli.failures import EXPECTED, INTERRUPTED, fail, is_out_of_memory, line_and_code, missing_extra
-from g3r.errors import G3RError, InputError
+from g3r.cli.failures import EXPECTED, INTERRUPTED, fail, line_and_code, missing_extra
+from g3r.errors import G3RError, InputError, is_out_of_memory
 
 PROG = "g3r-pretrain"
 
@@ -25,7 +25,7 @@ network (lightning_configs/mask.yaml). Logs for TensorBoard and checkpoints go t
   --model.network.NAME V   an argument of the network
   --data.source DIR        folder with atlas volumes and masks; "phantom" (default) needs no data
   --trainer.max_time T     DD:HH:MM:SS; the learning rate is annealed to fit
-  --ckpt_path FILE         resume from a training checkpoint
+  --ckpt_path FILE         resume from a training checkpoint; give the other options again
 
 All options: g3r-pretrain fit --help      Watch: tensorboard --logdir runs
 Afterwards:  g3r-export runs/prior/version_0/checkpoints/last.ckpt prior.safetensors
@@ -60,6 +60,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     class PretrainCLI(LightningCLI):
         def instantiate_trainer(self, **options: Any) -> Trainer:
             return super().instantiate_trainer(plugins=[WholeCheckpoints()], **options)
+
+        def _parse_ckpt_path(self) -> None:
+            """Leave the settings as they are given: Lightning would lay a checkpoint's over all of the model's."""
+
+        def after_instantiate_classes(self) -> None:
+            """Take the initial weights before the data are made, so that a wrong file is refused at once."""
+            if not self.config[self.subcommand].get("ckpt_path"):
+                self.model.take_initial_weights()
 
     try:
         PretrainCLI(

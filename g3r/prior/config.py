@@ -67,9 +67,21 @@ class PriorNetworkConfig:
             raise ValueError(f"template of {self.template_shape} voxels of {self.template_spacing_mm} mm")
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """Volumes that F sees, in order: V_coarse, and optionally two confidences, V_sharp and the template."""
+        used = {
+            "coarse": True,
+            "confidence in the brain": self.use_density,
+            "sharp": self.use_sharp,
+            "confidence": self.use_density,
+            "template": self.use_template,
+        }
+        return tuple(name for name, is_used in used.items() if is_used)
+
+    @property
     def n_inputs(self) -> int:
-        """Number of volumes that F sees: V_coarse, and optionally two confidences, V_sharp and the template."""
-        return 1 + 2 * self.use_density + self.use_sharp + self.use_template
+        """Number of volumes that F sees."""
+        return len(self.inputs)
 
     @property
     def template_grid(self) -> VolumeGrid:

@@ -16,8 +16,12 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from g3r.checkpoints.trained_model import TRAINING_ENTRY, NetworkConfig
+from g3r._version import __version__
+from g3r.checkpoints.trained_model import NetworkConfig, TrainedModel
+from g3r.checkpoints.training_checkpoint import TRAINING_ENTRY
 from g3r.errors import InputError
+from g3r.training.initial_weights import take_weights
+from g3r.training.resumption import check_resumed, use_present_rates
 
 FINAL_FACTOR = 0.01
 """Learning rate at the end over the peak rate."""
@@ -34,18 +38,22 @@ class AnnealedModule(LightningModule):
         learning_rate: peak rate of AdamW.
         weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
+        start_from: file with the initial weights, see `take_weights`. It is read when a training begins, and not when
+            one goes on from a checkpoint.
 
     Raises:
         ValueError: a rate is out of range.
     """
 
-    kind: ClassVar[str]
-    """Kind of the exported model: prior, pose or mask."""
+    model_type: ClassVar[type[TrainedModel]]
+    """The exported model: prior, pose or mask network."""
     network: Any
     weeks: list[float]
     """Gestational ages of the heads of the atlas template, of networks with one."""
 
-    def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:
+    def __init__(
+        self, learning_rate: float, weight_decay: float, warmup_steps: int, start_from: str | None = None
+    ) -> None:
         super().__init__()
         if not (learning_rate > 0 and weight_decay >= 0 and warmup_steps >= 0):
             raise ValueError(f"got {learning_rate=}, {weight_decay=}, {warmup_steps=}")
@@ -56,6 +64,7 @@ class AnnealedModule(LightningModule):
         self._timer: Timer | None = None
         self._throughput = _Throughput()
         self._training_data = "not recorded"
+        self._start_from = start_from
 
     def n_samples(self, batch: Any) -> int:
         """Number of samples of a batch."""
@@ -72,6 +81,28 @@ class AnnealedModule(LightningModule):
         """
         self.save_hyperparameters(ignore=["network"], frame=inspect.currentframe().f_back)  # type: ignore[union-attr]
         self.save_hyperparameters({"network": asdict(network)})
+
+    def on_fit_start(self) -> None:
+        """Take the initial weights, unless a checkpoint to go on with has been loaded by now."""
+        self.take_initial_weights()
+
+    def on_validation_start(self) -> None:
+        """Take the initial weights where nothing is trained."""
+        self.take_initial_weights()
+
+    def take_initial_weights(self) -> None:
+        """Take the initial weights, once.
+
+        Raises:
+            InputError: see `take_weights`.
+        """
+        path, self._start_from = self._start_from, None
+        if path is not None:
+            self.begin_with(path)
+
+    def begin_with(self, path: str) -> TrainedModel:
+        """Take the initial weights from a file; returns the network in it."""
+        return take_weights(self.network, path, self.model_type)
 
     def describe_data(self) -> dict[str, Any]:
         """Record the data module in words; return its settings."""
@@ -121,7 +152,9 @@ class AnnealedModule(LightningModule):
         """Add what `g3r-export` needs, as plain values only."""
         metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
         checkpoint[TRAINING_ENTRY] = {
-            "kind": self.kind,
+            "kind": self.model_type.kind,
+            "g3r_version": __version__,
+            "conventions": dict(self.model_type.conventions),
             "network_arguments": asdict(self.network.config),
             "training_data": self._training_data,
             "optimiser_steps": int(self.global_step),
@@ -129,15 +162,29 @@ class AnnealedModule(LightningModule):
             **self.own_description(),
         }
 
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Check that a checkpoint is one of this training; the optimiser goes on with the settings of now.
+
+        Raises:
+            InputError: see `check_resumed`.
+        """
+        check_resumed(checkpoint, self.model_type, self.network.config)
+        self._start_from = None
+        if self.trainer.state.fn == "fit":
+            use_present_rates(checkpoint, self.learning_rate, self.weight_decay)
+
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Note when the data arrived, and seed the step's own random numbers.
 
-        The seed depends only on the run's seed, the number of the step and that of the device, so that a killed run
-        that is resumed from a checkpoint draws the numbers that it would have drawn.
+        The seed depends only on the run's seed, the number of the step, that of the device and, where gradients of
+        several batches make a step, that of the batch in it. So a killed run that is resumed from a checkpoint draws
+        the numbers that it would have drawn.
         """
         self._throughput.start_batch()
         run_seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
-        seed = np.random.SeedSequence([run_seed, self.global_step, self.global_rank]).generate_state(1, np.uint64)[0]
+        # a last number of 0 leaves the seed as it would be without it
+        numbers = [run_seed, self.global_step, self.global_rank, batch_idx % self.trainer.accumulate_grad_batches]
+        seed = np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0]
         torch.manual_seed(int(seed >> np.uint64(1)))
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:

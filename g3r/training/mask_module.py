@@ -8,7 +8,6 @@ import torch
 from monai.losses import DiceCELoss
 from torch import Tensor
 
-from g3r.errors import InputError
 from g3r.mask_network.config import MaskNetworkConfig
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork, normalised
@@ -33,13 +32,13 @@ class MaskModule(AnnealedModule):
         weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
         wide_weight: weight of the loss in large pixels relative to that in small ones.
-        start_from: training checkpoint with the initial weights.
+        start_from: exported mask network, or training checkpoint of one, with the initial weights.
 
     Raises:
         ValueError: a rate is out of range, or from the network.
     """
 
-    kind = MaskModel.kind
+    model_type = MaskModel
     network: MaskNetwork
 
     def __init__(
@@ -51,14 +50,12 @@ class MaskModule(AnnealedModule):
         wide_weight: float = 1.0,
         start_from: str | None = None,
     ) -> None:
-        super().__init__(learning_rate, weight_decay, warmup_steps)
+        super().__init__(learning_rate, weight_decay, warmup_steps, start_from)
         if not wide_weight > 0:
             raise ValueError(f"got {wide_weight=}")
         self.keep_hyperparameters(network)
         self.wide_weight = wide_weight
         self.network = MaskNetwork(network)
-        if start_from is not None:
-            self._take_weights(start_from)
         # one Dice for the whole batch, because an image without brain has no Dice of its own
         self._loss = DiceCELoss(sigmoid=True, batch=True)
         self._scores: list[dict[str, float]] = []
@@ -111,18 +108,6 @@ class MaskModule(AnnealedModule):
         find = self._loss(self.network(batch["wide_image"]), batch["wide_mask"])
         outline = self._loss(self.network(batch["image"]), batch["mask"])
         return find, outline
-
-    def _take_weights(self, path: str) -> None:
-        """Start from the weights of another run."""
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-            prefix = "network."
-            self.network.load_state_dict({n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)})
-        except Exception as error:  # torch.load raises many types for a damaged file
-            raise InputError(
-                f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
-                "checkpoint of this mask network"
-            ) from error
 
 
 def dice(predicted: Tensor, true: Tensor) -> float:

@@ -1,17 +1,12 @@
 """Training of the pose network."""
 
-import logging
 from collections.abc import Mapping
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from g3r.checkpoints.trained_model import TRAINING_ENTRY
-from g3r.errors import InputError
 from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.geometry import moved_points, rotation_from_vector
 from g3r.pose_network.inference import as_pose, poses_of
@@ -19,8 +14,6 @@ from g3r.pose_network.model import PoseModel
 from g3r.pose_network.network import PoseNetwork, PoseStep
 from g3r.training.annealed_module import AnnealedModule
 from g3r.training.pose_scores import SLICE_POINTS_MM, panel, scores_of, summary
-
-logger = logging.getLogger(__name__)
 
 Batch = Mapping[str, Tensor]
 """A `SliceBatch` with `true_rotation` [S, 3, 3] and `true_translation_mm` [S, 3]."""
@@ -56,13 +49,13 @@ class PoseModule(AnnealedModule):
         learning_rate: peak rate of AdamW.
         weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
-        start_from: training checkpoint with the initial weights.
+        start_from: exported pose network, or training checkpoint of one, with the initial weights.
 
     Raises:
         ValueError: a rate is out of range, or from the network.
     """
 
-    kind = PoseModel.kind
+    model_type = PoseModel
     network: PoseNetwork
 
     def __init__(
@@ -73,11 +66,9 @@ class PoseModule(AnnealedModule):
         warmup_steps: int = 200,
         start_from: str | None = None,
     ) -> None:
-        super().__init__(learning_rate, weight_decay, warmup_steps)
+        super().__init__(learning_rate, weight_decay, warmup_steps, start_from)
         self.keep_hyperparameters(network)
         self.network = PoseNetwork(network)
-        if start_from is not None:
-            self._take_weights(Path(start_from))
         self.weeks = []
         self._scores: list[dict[str, np.ndarray]] = []
         self._panel: Tensor | None = None
@@ -133,31 +124,6 @@ class PoseModule(AnnealedModule):
         """
         self.check_data("pixel_mm", "image_size")
         self.take_template()
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Raise `InputError` for a checkpoint of another network or template."""
-        before, now = checkpoint.get(TRAINING_ENTRY, {}).get("network_arguments"), asdict(self.network.config)
-        if before is not None and before != now:
-            raise InputError(f"ckpt_path: its network is {before}, now it is {now}; resume with the same data")
-
-    def _take_weights(self, path: Path) -> None:
-        """Start from those weights of another run that fit; the template comes from the data module."""
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-            own = self.network.state_dict()
-            taken = {name.removeprefix("network."): value for name, value in state.items()}
-            taken = {name: v for name, v in taken.items() if name in own and v.shape == own[name].shape}
-            fresh = sorted(own.keys() - taken.keys() - {"template"})
-            if len(fresh) == len(own) - 1:
-                raise ValueError("no array of it fits")
-            if fresh:
-                logger.warning("model.start_from: %d of %d arrays start anew", len(fresh), len(own))
-            self.network.load_state_dict({**own, **taken, "template": own["template"]})
-        except Exception as error:  # torch.load raises many types for a damaged file
-            raise InputError(
-                f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
-                "checkpoint of a pose network"
-            ) from error
 
     def own_description(self) -> dict[str, Any]:
         """Values that a `PoseModel` needs besides its weights."""

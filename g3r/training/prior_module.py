@@ -5,13 +5,14 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from g3r.checkpoints.trained_model import TRAINING_ENTRY
+from g3r.checkpoints.training_checkpoint import TRAINING_ENTRY
 from g3r.errors import InputError
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork, PriorOutput
 from g3r.prior.inputs import PriorInputs
 from g3r.prior.model import VOXEL_MM_TOLERANCE, Prior
 from g3r.training.annealed_module import AnnealedModule
+from g3r.training.initial_weights import OPTION
 from g3r.training.prior_batches import (
     DENSITY_KINDS,
     Batch,
@@ -34,6 +35,7 @@ from g3r.training.prior_validation import (
 )
 
 DEFAULT_NETWORK = PriorNetworkConfig()
+PLAIN = f"--model.density={DENSITY_KINDS[0]}"
 
 
 class PriorModule(AnnealedModule):
@@ -54,15 +56,14 @@ class PriorModule(AnnealedModule):
         density: definition of M_rho for gate and F, of `DENSITY_KINDS`. All but the first are for comparison: such a
             network cannot be exported.
         voxel_mm: isotropic voxel size of the training data; None takes the data module's `spacing_mm`.
-        start_from: exported prior with the initial weights; channels that it lacks start at zero, and so
-            does the last layer if its prior has another base.
+        start_from: exported prior, or training checkpoint of one, with the initial weights; channels that it lacks
+            start at zero, and so does the last layer if its prior has another base.
 
     Raises:
         ValueError: a rate or weight is out of range, or from the network.
-        InputError: `start_from` cannot be read, or its network has another size.
     """
 
-    kind = Prior.kind
+    model_type = Prior
     network: DensityGatedPriorNetwork
 
     def __init__(
@@ -77,7 +78,7 @@ class PriorModule(AnnealedModule):
         voxel_mm: float | None = None,
         start_from: str | None = None,
     ) -> None:
-        super().__init__(learning_rate, weight_decay, warmup_steps)
+        super().__init__(learning_rate, weight_decay, warmup_steps, start_from)
         if not 0 <= background_weight <= 1:
             raise ValueError(f"got {background_weight=}")
         if density not in DENSITY_KINDS:
@@ -86,8 +87,6 @@ class PriorModule(AnnealedModule):
         self.keep_hyperparameters(network)
         self.network = DensityGatedPriorNetwork(network)
         self._learnt_at_mm: dict[str, float] = {}
-        if start_from is not None:
-            self._learnt_at_mm["model.start_from"] = take_weights(self.network, start_from)
         self.background_weight = background_weight
         self.augment_orientation = augment_orientation
         self.voxel_mm = voxel_mm
@@ -158,8 +157,21 @@ class PriorModule(AnnealedModule):
         """
         self.take_template()
 
+    def begin_with(self, path: str) -> Prior:
+        """Take the initial weights; the last layer starts at zero where the residual is added to something else."""
+        other = super().begin_with(path)
+        assert isinstance(other, Prior)
+        self._learnt_at_mm[OPTION] = other.voxel_mm
+        mine, theirs = self.network.config, other.network.config
+        if (mine.sharp_base, mine.use_template) != (theirs.sharp_base, theirs.use_template):
+            head = self.network.refiner.head
+            torch.nn.init.zeros_(head.weight)
+            torch.nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+        return other
+
     def on_fit_start(self) -> None:
-        """Take the voxel size from the data module, once a checkpoint to go on with is loaded."""
+        """Take initial weights and, once a checkpoint to go on with is loaded, the data module's voxel size."""
+        super().on_fit_start()
         self.take_voxel_size()
 
     def take_voxel_size(self) -> None:
@@ -187,49 +199,23 @@ class PriorModule(AnnealedModule):
                 )
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Note the voxel size of a run that is resumed; `take_voxel_size` compares it with the data's."""
-        voxel_mm = checkpoint.get(TRAINING_ENTRY, {}).get("voxel_mm")
-        if voxel_mm is not None:
-            self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
+        """Check the density, and note the voxel size, which `take_voxel_size` compares with the data's.
+
+        Raises:
+            InputError: the checkpoint is of another training.
+        """
+        super().on_load_checkpoint(checkpoint)
+        entry = checkpoint[TRAINING_ENTRY]
+        before, now = (one.get("comparison_only") or PLAIN for one in (entry, self.own_description()))
+        if before != now:
+            raise InputError(f"ckpt_path: was trained with {before}, now it is {now}; resume with {before}")
+        if entry["voxel_mm"] is not None:
+            self._learnt_at_mm["ckpt_path"] = float(entry["voxel_mm"])
 
     def own_description(self) -> dict[str, Any]:
         """Values that a `Prior` needs besides its weights."""
+        own = {"voxel_mm": self.voxel_mm, "weeks": self.weeks}
         # g3r-infer passes the coverage to every prior
-        kind = self.kind if self.density == DENSITY_KINDS[0] else f"{self.kind} of the {self.density} density"
-        return {"voxel_mm": self.voxel_mm, "weeks": self.weeks, "kind": kind}
-
-
-def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
-    """Start from the weights of an exported prior, whose network may lack the template.
-
-    Returns:
-        The voxel size (mm) of their training.
-
-    Raises:
-        InputError: the file cannot be read, or its network has other channels, units or inputs.
-    """
-    other = Prior.load(path)
-    own = network.state_dict()
-    mine, theirs = network.config, other.network.config
-    # the template is the last input of the first layer; if another one were missing, later ones would take its place
-    same_inputs = (mine.use_sharp, mine.use_density) == (theirs.use_sharp, theirs.use_density)
-    for name, given in other.network.state_dict().items():
-        if name == "template":  # that of the data module is used
-            continue
-        into = own.get(name)
-        fits = into is not None and into.ndim == given.ndim and into.shape[:1] == given.shape[:1]
-        fits = fits and same_inputs
-        if into is None or not fits or into.shape[2:] != given.shape[2:] or into.numel() < given.numel():
-            raise InputError(
-                f"model.start_from: {path} has {theirs}, this network differs; "
-                "give it the same channels and units, V_sharp and densities"
-            )
-        if into.shape != given.shape:
-            into.zero_()
-            into[:, : given.shape[1]] = given
-        else:
-            into.copy_(given)
-    if (mine.sharp_base, mine.use_template) != (theirs.sharp_base, theirs.use_template):
-        torch.nn.init.zeros_(network.refiner.head.weight)
-        torch.nn.init.zeros_(network.refiner.head.bias)  # type: ignore[arg-type]
-    return other.voxel_mm
+        return (
+            own if self.density == DENSITY_KINDS[0] else {**own, "comparison_only": f"--model.density={self.density}"}
+        )

@@ -112,7 +112,7 @@ def estimated(checkpoint: Path, kind: str, volumes: Sequence[Mapping[str, Tensor
     """
     import torch
 
-    from g3r.checkpoints.trained_model import TRAINING_ENTRY
+    from g3r.checkpoints.training_checkpoint import TRAINING_ENTRY
     from g3r.prior.config import PriorNetworkConfig
     from g3r.prior.dgpn import DensityGatedPriorNetwork
     from g3r.training.prior_batches import prior_inputs

@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
+from g3r.checkpoints.training_checkpoint import TRAINING_ENTRY
 from g3r.cli.export import main
+from g3r.prior.model import Prior
 
 FAILURES = [
     (KeyboardInterrupt(), 130, "interrupted"),
@@ -16,7 +19,7 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("failure", "code", "says"), FAILURES)
-@pytest.mark.parametrize("where", ["torch.load", "g3r.cli.export._weights"])
+@pytest.mark.parametrize("where", ["torch.load", "g3r.prior.model.Prior.from_training"])
 def test_ctrl_c_and_little_memory_end_in_one_line(
     where: str,
     failure: BaseException,
@@ -29,13 +32,11 @@ def test_ctrl_c_and_little_memory_end_in_one_line(
     def failing(*arguments: object, **options: object) -> None:
         raise failure
 
-    entry = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
-    monkeypatch.setattr("g3r.cli.export._read_run", lambda run, name: {"state_dict": {}, name: entry})
-    if where == "torch.load":
-        monkeypatch.undo()
+    entry = {"kind": "prior", "training_data": "", "optimiser_steps": 1, "conventions": Prior.conventions}
+    torch.save({"state_dict": {}, TRAINING_ENTRY: entry}, tmp_path / "last.ckpt")
     monkeypatch.setattr(where, failing)
     assert main([str(tmp_path / "last.ckpt"), str(tmp_path / "prior.safetensors")]) == code
     said = capsys.readouterr().err
     assert said.startswith(f"g3r-export: {says}")
     assert said.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+    assert [one.name for one in tmp_path.iterdir()] == ["last.ckpt"]

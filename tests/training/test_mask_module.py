@@ -97,14 +97,6 @@ def test_export_and_load(trained: tuple[Path, Path, MaskModule], tmp_path: Path)
         Prior.load(file)
 
 
-def test_start_from_takes_all_weights_of_a_checkpoint(trained: tuple[Path, Path, MaskModule], tmp_path: Path) -> None:
-    again = MaskModule(network=NETWORK, start_from=str(trained[1]))
-    for name, value in trained[2].network.state_dict().items():
-        assert torch.equal(again.network.state_dict()[name].cpu(), value.cpu()), name
-    with pytest.raises(InputError, match="start_from"):
-        MaskModule(network=NETWORK, start_from=str(tmp_path / "none.ckpt"))
-
-
 def test_data_of_another_resolution_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"data\.pixel_mm: 2\.0"):
         trainer(tmp_path, max_epochs=1).fit(MaskModule(network=NETWORK), datamodule=TinyData(pixel_mm=2.0))

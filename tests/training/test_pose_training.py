@@ -1,7 +1,7 @@
 """Training of the pose network, its logs, and export."""
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +132,9 @@ def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys:
     ("alter", "expected"),
     [
         (lambda content: content.pop("g3r_export"), "not written by this version of g3r-pretrain"),
-        (lambda content: content["g3r_export"].update(weeks=[25.0]), "cannot be exported"),
-        (lambda content: content["g3r_export"].update(kind="mask"), "cannot be exported"),
-        (lambda content: content["state_dict"].popitem(), "cannot be exported"),
+        (lambda content: content["g3r_export"].update(weeks=[25.0]), "cannot be used"),
+        (lambda content: content["g3r_export"].update(kind="mask"), "cannot be used"),
+        (lambda content: content["state_dict"].popitem(), "cannot be used"),
     ],
 )
 def test_export_refuses(
@@ -158,7 +158,7 @@ def test_data_that_do_not_fit(tmp_path: Path, settings: dict[str, Any], message:
 
 def test_resuming_with_another_template_is_refused(trained: Trained, tmp_path: Path) -> None:
     module = PoseModule(**SMALL)
-    with pytest.raises(InputError, match="resume with the same data"):
+    with pytest.raises(InputError, match=r"template_shape .* resume with the same data"):
         trainer(tmp_path, max_epochs=2).fit(module, TinyData(n_ages=3), ckpt_path=trained[1], weights_only=True)
 
 
@@ -195,19 +195,6 @@ def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are() -> None:
     changed = (moved.abs().sum(1) > 0).reshape(n_heads, -1)
     assert (changed.all(1) | ~changed.any(1)).all()
     assert 5 < changed.all(1).sum() < n_heads - 5
-
-
-def test_starting_from_other_weights(trained: Trained, tmp_path: Path) -> None:
-    fresh = PoseModule(**SMALL, start_from=str(trained[1]))
-    for one, other in zip(fresh.network.parameters(), trained[2].network.parameters(), strict=True):
-        torch.testing.assert_close(one, other.cpu())
-    with pytest.raises(InputError, match=r"start_from: .* cannot be used"):
-        PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
-    wider = PoseModule(replace(NETWORK, width=64), start_from=str(trained[1]))  # only matching weights are taken
-    torch.testing.assert_close(
-        wider.network.get_parameter("encoder.stem.conv.weight"),
-        trained[2].network.get_parameter("encoder.stem.conv.weight").cpu(),
-    )
 
 
 def test_the_configuration_fits(pytestconfig: pytest.Config) -> None:

@@ -18,7 +18,6 @@ from g3r.checkpoints.plain_values import config_from_plain
 from g3r.cli import export
 from g3r.errors import InputError
 from g3r.prior.config import PriorNetworkConfig
-from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.model import Prior
 
 pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
@@ -138,11 +137,18 @@ def spoil(content: dict[str, Any]) -> None:
     [
         (without("g3r_export"), "not written by this version of g3r-pretrain"),
         (without("state_dict"), "not written by this version of g3r-pretrain"),
-        (lambda content: content["g3r_export"].update(voxel_mm=None), "cannot be exported"),
+        (lambda content: content["g3r_export"].update(voxel_mm=None), "cannot be used"),
         (lambda content: content["g3r_export"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
         (lambda content: content["g3r_export"].update(weeks=[25.0]), "1 ages for a template of 2"),
-        (lambda content: content["state_dict"].popitem(), "cannot be exported"),
+        (lambda content: content["state_dict"].popitem(), "cannot be used"),
         (spoil, "NaN or infinity"),
+        (lambda content: content["g3r_export"].update(kind="liver"), "kind 'liver'; expected one of prior, pose, mask"),
+        (
+            lambda content: content["g3r_export"]["conventions"].update(density_convention="old"),
+            "its density convention is 'old' (trained by g3r",
+        ),
+        # of versions that did not record them
+        (lambda content: content["g3r_export"].pop("conventions"), "is not recorded (trained by g3r"),
     ],
 )
 def test_export_refuses(
@@ -172,7 +178,11 @@ def test_a_network_of_another_density_is_for_comparison_alone(
     done.fit(module, TinyData())
     done.save_checkpoint(tmp_path / "run.ckpt")
     assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.safetensors")]) == 3
-    assert "prior of the masked density" in capsys.readouterr().err
+    assert "was trained with --model.density=masked, for comparison only" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"ckpt_path: was trained with --model\.density=masked, now it is .*coverage"):
+        trainer(tmp_path, max_steps=2).fit(
+            training.PriorModule(**SMALL), TinyData(), ckpt_path=tmp_path / "run.ckpt", weights_only=True
+        )
     with pytest.raises(ValueError, match="expected one of coverage, masked, printed"):
         training.PriorModule(**SMALL, density="other")
 
@@ -225,37 +235,6 @@ def test_a_patch_can_be_learnt() -> None:
         batches.weighted_l1(volume, batch["truth"], weight) for volume in (found.volume, batch["coarse"])
     )
     assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
-
-
-@pytest.mark.parametrize("use_template", [False, True])
-def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_template: bool) -> None:
-    """With another base the residual starts at zero; the template is that of the data, not of the file."""
-    torch.manual_seed(0)
-    old = DensityGatedPriorNetwork(replace(NETWORK, use_template=use_template))
-    torch.nn.init.normal_(old.refiner.head.weight)
-    path = tmp_path / "old.safetensors"
-    old.set_template(torch.rand(3, 2, 2, 2))  # another shape, which must not be taken
-    Prior(network=old, voxel_mm=0.8, weeks=(25.0, 28.0, 31.0), training_data="noise").save(path)
-    given = given_at_random(8, 8, 8)
-    new = training.PriorModule(NETWORK, start_from=str(path)).network
-    assert new.config.template_shape == NETWORK.template_shape
-    if use_template:
-        for one, other in zip(new(given), old(given), strict=True):
-            torch.testing.assert_close(one, other)
-    else:
-        torch.testing.assert_close(new(given).volume, given.base(NETWORK))
-        # channels that the file lacks start without effect
-        shown = replace(given, template=torch.rand(1, 1, 8, 8, 8))
-        new.refiner.head.load_state_dict(old.refiner.head.state_dict())
-        torch.testing.assert_close(new.refiner(shown)[0], old.refiner(given)[0])
-    moved_base = replace(NETWORK, sharp_base=True)
-    moved = training.PriorModule(moved_base, start_from=str(path)).network
-    torch.testing.assert_close(moved(given).volume, given.base(moved_base))
-    for config in (replace(NETWORK, use_sharp=False), replace(NETWORK, use_density=False)):
-        with pytest.raises(InputError, match="V_sharp and densities"):
-            training.PriorModule(config, start_from=str(path))
-    with pytest.raises(InputError, match="give it the same channels and units"):
-        training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
 
 
 def test_learning_rate_follows_the_budget_that_ends_first(tmp_path: Path) -> None:
