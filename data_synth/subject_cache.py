@@ -14,7 +14,7 @@ from data_synth.simulator import SIMULATOR_VERSION
 from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
 
-SYNTHESIS_VERSION = 6
+SYNTHESIS_VERSION = 7
 """Version of the synthesis, raised whenever it changes, so that cached subjects of an earlier version are not used.
 Cached subjects also depend on the version of the simulated slices, `SIMULATOR_VERSION`."""
 
