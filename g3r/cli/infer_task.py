@@ -222,7 +222,6 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         preset.registration,
         standard_orientation=options.space == "standard",
         leave_out_misfits=preset.registration.leave_out_misfits and options.misfits == "leave-out",
-        seed=options.seed,
     )
     settings = replace(
         preset,

@@ -54,7 +54,7 @@ class ReconstructionSettings:
         common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         anatomy: what the stacks show; see `for_anatomy`.
-        seed: of every random choice.
+        seed: of every random choice, that of `registration` included.
     """
 
     resolution_mm: float = 0.8
@@ -82,6 +82,10 @@ class ReconstructionSettings:
     fill_unseen: bool = True
     anatomy: Anatomy = FETAL_BRAIN
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.registration.seed != self.seed:
+            object.__setattr__(self, "registration", replace(self.registration, seed=self.seed))
 
     @property
     def lattice(self) -> LatticeSpacing:

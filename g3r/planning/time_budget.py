@@ -137,7 +137,7 @@ class TimeBudget:
         preset = PRESETS[name].registration
         # what was switched off stays off, whatever the budget allows
         switches = {one: getattr(preset, one) and getattr(asked, one) for one in SWITCHES}
-        chosen = replace(preset, standard_orientation=asked.standard_orientation, seed=asked.seed, **switches)
+        chosen = replace(preset, standard_orientation=asked.standard_orientation, **switches)
         self.settings = replace(self.settings, registration=chosen)
         self.choices["registration"] = name
         logger.info("time budget: %.0f s left, registration as in %s", left, name)

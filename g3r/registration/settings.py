@@ -28,7 +28,7 @@ class RegistrationSettings:
         standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
         check_handedness: test whether a stack is a mirror image of the others, where an atlas template fits.
         leave_out_misfits: leave out stacks that do not fit the others, if most do, and register those anew.
-        seed: of the random search.
+        seed: of the random search; in a reconstruction it is that of `ReconstructionSettings`.
     """
 
     template: bool = True

@@ -75,8 +75,8 @@ def test_more_time_never_means_a_shorter_registration() -> None:
 
 
 def test_registration_keeps_the_space_and_the_seed_that_were_asked_for() -> None:
-    registration = replace(SETTINGS.registration, standard_orientation=False, seed=7)
-    one = budget(60.0, replace(SETTINGS, registration=registration))
+    registration = replace(SETTINGS.registration, standard_orientation=False)
+    one = budget(60.0, replace(SETTINGS, registration=registration, seed=7))
     deadline = one.for_registration()
     assert one.settings.registration.seed == 7
     assert not one.settings.registration.standard_orientation
