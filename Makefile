@@ -35,7 +35,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo docs docs-serve test test-slow test-numerics test-faults container-check lint types pretrain tensorboard bench bench-phantom fit-uncertainty results clean
+.PHONY: help install demo docs docs-serve test coverage test-slow test-numerics test-faults container-check lint types pretrain tensorboard bench bench-phantom fit-uncertainty results clean
 
 help: ## show this list
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -137,6 +137,6 @@ bench-phantom: install ## a small phantom of the size that other methods were ti
 results: install ## docs/results.md anew, from the tables that studies have published in the other pages
 	$(BIN)/python -m studies.results.page
 
-clean: ## remove what the commands above made, the environment excepted
+clean: ## remove demo, builds and caches; runs/ (trainings, exported weights, measurements) and .venv stay
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find g3r data_synth studies tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -53,23 +53,30 @@ def test_files_that_are_named_exist(path: Path) -> None:
             assert file_of(text), f"{name_of(path)}: {text}"
 
 
+def names_defined(module: ast.Module) -> set[str]:
+    """Names of functions, classes and fields, and of what is assigned to, anywhere in a module."""
+    found = set()
+    for node in ast.walk(module):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found |= {one.id for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)}
+    return found
+
+
+def test_a_name_that_is_only_read_is_not_defined() -> None:
+    module = ast.parse("from a import B\nC: int = B\nD, E = B.f(C)\nclass G:\n    h: B\n    def i(self): j = 1")
+    assert names_defined(module) == {"C", "D", "E", "G", "h", "i", "j"}
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
 def test_functions_that_are_named_exist(path: Path) -> None:
     """References have the form `room/module.py`: `name` or `Class.name`."""
     for text, names in re.findall(r"`([\w/]+\.py)`: ((?:`[\w.]+`(?:, )?)+)", path.read_text(encoding="utf-8")):
         file = file_of(text)
         assert file, f"{name_of(path)}: {text}"
-        defined = {
-            name
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-            for name in (
-                [node.name]
-                if isinstance(node, ast.FunctionDef | ast.ClassDef)
-                else [one.id for one in ast.walk(node) if isinstance(one, ast.Name)]
-                if isinstance(node, ast.Assign | ast.AnnAssign)
-                else []
-            )
-        }
+        defined = names_defined(ast.parse(file.read_text(encoding="utf-8")))
         for name in re.findall(r"`([\w.]+)`", names):
             assert set(name.split(".")) <= defined, f"{name_of(path)}: {text} has no {name}"
 

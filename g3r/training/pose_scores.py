@@ -33,7 +33,7 @@ def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.n
     Args:
         first: [S] poses after the first step.
         last: [S] poses after the last step.
-        batch: the slices of this one head; see `PoseDataModule`.
+        batch: the slices of this one head; see `SliceSetDataModule`.
 
     Returns:
         [S] or [T] errors by name, for S slices in T stacks.
