@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 N_PHANTOMS = 24
 """Number of phantoms made for training; augmentation varies each further."""
 
+MARGIN_VOXELS = 3
+"""Background around a head."""
+
 WEEKS_RANGE = (15.0, 45.0)
 """Range of gestational ages that are accepted from a name."""
 
@@ -141,15 +144,14 @@ def load_volume_of(subject: Subject, spacing_mm: float | None) -> TruthVolume:
     )
 
 
-def load_head(subject: Subject, spacing_mm: float, margin_voxels: int = 3) -> TruthVolume:
+def load_head(subject: Subject, spacing_mm: float) -> TruthVolume:
     """The subject in the atlas frame: cropped, zero outside the mask, the mask's centroid at the origin.
 
     Args:
         subject: for errors see `load_subject`.
         spacing_mm: isotropic voxel size.
-        margin_voxels: background around the head.
     """
-    volume = cropped(load_volume_of(subject, spacing_mm), margin_voxels)
+    volume = cropped(load_volume_of(subject, spacing_mm), MARGIN_VOXELS)
     centroid_mm = VolumeGrid(volume.data.shape, volume.affine).world(center_of_mass(volume.mask))
     affine = volume.affine.copy()
     affine[:3, 3] -= centroid_mm

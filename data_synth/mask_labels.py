@@ -88,3 +88,17 @@ def draw_intensities(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDA
         if anything and not (tissue is Tissue.SKULL and rng.random() < DARK_SKULL_SHARE):
             mean[tissue], texture[tissue] = rng.uniform(0, 1.2), rng.uniform(0, MAX_ANY_TEXTURE)
     return mean, texture
+
+
+def textured(
+    labels: NDArray[np.integer], noise: NDArray[np.float32], mean: NDArray[np.float32], texture: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Intensities of voxels, not negative.
+
+    Args:
+        labels: tissue of each voxel, any shape.
+        noise: of the same shape, of standard deviation 1.
+        mean: intensity of each tissue, see `draw_intensities`.
+        texture: standard deviation in each tissue, as a share of its intensity.
+    """
+    return np.maximum(mean[labels] + (mean * texture)[labels] * noise, 0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from data_synth.mask_head import SceneHead
-from data_synth.mask_labels import Tissue, draw_intensities
+from data_synth.mask_labels import Tissue, draw_intensities, textured
 from data_synth.mask_slicing import image_slices
 from data_synth.mask_surroundings import Surroundings
 from data_synth.motion import LEVELS, slice_trajectory
@@ -210,11 +210,11 @@ def _coloured(scene: Scene, rng: np.random.Generator, hidden: bool) -> tuple[NDA
     behind = np.zeros(around.labels.shape, np.float32)
     black = not hidden and rng.random() < BLACK_SHARE
     if not black:
-        behind = _intensities(around.labels, around.texture, mean, texture)
+        behind = textured(around.labels, around.texture, mean, texture)
     if not hidden:
         brain = head.labels == Tissue.BRAIN
         if not black:
-            volume[..., 0] = _intensities(head.labels, head.texture, mean, texture)
+            volume[..., 0] = textured(head.labels, head.texture, mean, texture)
             volume[..., 1] = head.labels > 0
         elif (head.labels == Tissue.CSF).any():
             brain = brain | (head.labels == Tissue.CSF)
@@ -224,9 +224,3 @@ def _coloured(scene: Scene, rng: np.random.Generator, hidden: bool) -> tuple[NDA
         volume[brain, 1] = 1
         volume[..., 2] = head.inside
     return volume, behind
-
-
-def _intensities(
-    labels: NDArray[np.uint8], noise: NDArray[np.float32], mean: NDArray[np.float32], texture: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    return np.maximum(mean[labels] + (mean * texture)[labels] * noise, 0)

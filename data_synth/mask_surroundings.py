@@ -106,7 +106,7 @@ def draw_surroundings(base_mm: Array, radius_mm: float, rng: np.random.Generator
     canvas = _Canvas(middle, rng)
     mother, uterus = _mother(canvas, middle, down, r, rng)
     for _ in range(int(rng.integers(4, 14))):
-        _maternal_body(canvas, middle, mother, rng)
+        _maternal_body(canvas, mother, rng)
     _uterus(canvas, uterus, r, rng)
     canvas.put(Tissue.FETAL_BODY, trunk, size, bend)
     if rng.random() < 0.7:  # bowel, kidneys and other organs: as heterogeneous as a brain
@@ -158,7 +158,7 @@ def _mother(
     return body, uterus
 
 
-def _maternal_body(canvas: _Canvas, middle: Array, mother: Ellipsoid, rng: np.random.Generator) -> None:
+def _maternal_body(canvas: _Canvas, mother: Ellipsoid, rng: np.random.Generator) -> None:
     """Paint one maternal structure: bladder, organ, vessel, spine with canal, head-like ball or bowel loop."""
     centre, radius, turn = mother
     at = centre + turn @ (rng.uniform(-0.8, 0.8, 3) * radius)

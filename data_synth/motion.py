@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.interleave import acquisition_order
+from g3r.acquisition.interleave import place_in_time
 from g3r.geometry import RigidPose
 
 Array = NDArray[np.float64]
@@ -89,13 +89,6 @@ def slice_trajectory(
     )
     in_time = RigidPose.from_rotvec(np.deg2rad(angle_deg), translation_mm) @ offset
     return about(in_time.take(place_in_time(n_slices, interleave)), center_mm)
-
-
-def place_in_time(n_slices: int, interleave: int) -> NDArray[np.int64]:
-    """Acquisition rank of each slice of a stack [K], in the order of the slices in space."""
-    place = np.empty(n_slices, np.int64)
-    place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
-    return place
 
 
 def about(pose: RigidPose, center_mm: Array) -> RigidPose:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.motion import LEVELS, place_in_time, slice_trajectory
+from data_synth.motion import LEVELS, slice_trajectory
 from data_synth.trajectories import RecordedTrajectory, timed_trajectory
+from g3r.acquisition.interleave import place_in_time
 from g3r.geometry import RigidPose
 
 Array = NDArray[np.float64]

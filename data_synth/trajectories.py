@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.motion import place_in_time
+from g3r.acquisition.interleave import place_in_time
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 

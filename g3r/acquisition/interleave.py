@@ -28,3 +28,10 @@ def acquisition_order(n_slices: int, interleave: int) -> NDArray[np.int64]:
         raise ValueError(f"interleave {interleave}; expected at least 1")
     its_pass, place = pass_and_place(np.arange(n_slices), interleave)
     return np.lexsort((place, its_pass))
+
+
+def place_in_time(n_slices: int, interleave: int) -> NDArray[np.int64]:
+    """Acquisition rank of each slice of a stack [K], in the order of the slices in space."""
+    place = np.empty(n_slices, np.int64)
+    place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
+    return place

@@ -107,24 +107,23 @@ class SceneSize:
     n_voxels: int = 125_000
 
 
-def made_cloud(size: SceneSize, seed: int = 0) -> GaussianCloud:
+def made_cloud(size: SceneSize) -> GaussianCloud:
     """Gaussians at random in the cube, their axes 0.8 to 1.25 times the common sigma."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     n = size.n_gaussians
     mean = rng.uniform(-CUBE_MM / 2, CUBE_MM / 2, (n, 3))
     log_scale = np.log(SIGMA_MM) + rng.uniform(np.log(0.8), np.log(1.25), (n, 3))
     return _cloud(mean, log_scale, rng.standard_normal((n, 4)), rng.uniform(0.5, 1.0, n) * (8000 / n))
 
 
-def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
+def made_slices(size: SceneSize, cloud: GaussianCloud) -> Slices:
     """Slices of a cloud in three orthogonal stacks, with noise.
 
     Args:
         size: number of slices and of their pixels.
         cloud: imaged cloud.
-        seed: seed of the noise.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     per_stack = [len(part) for part in np.array_split(np.arange(size.n_slices), len(FRAMES))]
     stack_id = np.repeat(np.arange(len(FRAMES)), per_stack)
     rotation = np.array(FRAMES)[stack_id]

@@ -23,7 +23,6 @@ GB = 1e9
 class Point:
     """Seconds and quality of one setting on one case."""
 
-    group: str
     label: str
     seconds: float
     psnr_db: float
@@ -36,11 +35,11 @@ def points_of(case: Mapping[str, Any], base: str) -> list[Point]:
     with the stages that differ exchanged.
     """
     presets = case["presets"]
-    points = [Point("preset", name, row["seconds"], row["psnr_db"]) for name, row in presets.items()]
-    for sweep, variants in case.get("sweeps", {}).items():
+    points = [Point(name, row["seconds"], row["psnr_db"]) for name, row in presets.items()]
+    for variants in case.get("sweeps", {}).values():
         offset = sweep_offset(case, base)
         points += [
-            Point(sweep, label, row["seconds"] + offset, row["psnr_db"])
+            Point(label, row["seconds"] + offset, row["psnr_db"])
             for label, row in variants.items()
             if not row["same_as_base"]
         ]

@@ -58,7 +58,7 @@ LISTS = {"image_type": "ImageType", "scanning_sequence": "ScanningSequence"}
 MR_CLASSES = "1.2.840.10008.5.1.4.1.1.4"
 """Prefix of the UIDs of MR image classes. Such a file has pixels; without them its header is cut off."""
 
-POSITION, AXES, SPACING = "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"
+POSITION, AXES = "ImagePositionPatient", "ImageOrientationPatient"
 
 Value = TypeVar("Value")
 

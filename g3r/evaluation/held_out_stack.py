@@ -100,12 +100,7 @@ class PredictedPixels:
 
 
 def predict_stack(
-    volume: Volume,
-    stack: Stack,
-    *,
-    support: NDArray[np.bool_] | None = None,
-    eroded_pixels: int = ERODED_PIXELS,
-    seed: int = 0,
+    volume: Volume, stack: Stack, *, support: NDArray[np.bool_] | None = None, eroded_pixels: int = ERODED_PIXELS
 ) -> StackPrediction:
     """Compare a stack with its prediction by a volume.
 
@@ -115,18 +110,15 @@ def predict_stack(
         support: [I, J, K] voxels that count, among those that are not zero; None counts all of these. Use the same
             support to compare two volumes.
         eroded_pixels: width of the mask's rim that does not count.
-        seed: seed of the search.
 
     Raises:
         InputError: the volume or the stack cannot be used, or the stack is not found in the volume.
     """
-    found = predicted_pixels(volume, stack, support=support, seed=seed)
+    found = predicted_pixels(volume, stack, support=support)
     return score_prediction(found, stack.name, volume.name, eroded_pixels)
 
 
-def predicted_pixels(
-    volume: Volume, stack: Stack, *, support: NDArray[np.bool_] | None = None, seed: int = 0
-) -> PredictedPixels:
+def predicted_pixels(volume: Volume, stack: Stack, *, support: NDArray[np.bool_] | None = None) -> PredictedPixels:
     """Find the slices of a stack in a volume, and simulate them there; for arguments see `predict_stack`.
 
     Raises:
@@ -139,7 +131,7 @@ def predicted_pixels(
         raise InputError(f"{volume.name}: shows nothing; expected a volume that is not zero where the head is")
     slices, _ = normalised_slices([stack])
     # the whole volume, because slices do not fit a cropped one
-    slices, found = place_in_volume(slices, data / np.float32(scale), volume.grid, np.random.default_rng(seed))
+    slices, found = place_in_volume(slices, data / np.float32(scale), volume.grid, np.random.default_rng(0))
     predicted, seen = (_simulated(one, slices, volume) for one in (data, shown.astype(np.float32)))
     return PredictedPixels(slices=slices, value=predicted, seen=seen, search_correlation=found)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from g3r.acquisition.interleave import acquisition_order
+from g3r.acquisition.interleave import place_in_time
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.open_strain import open_strain, tilts
@@ -115,7 +115,7 @@ def motion_shear(slices: Slices, interleave: Sequence[int | None]) -> MotionShea
     variance = 0.0
     for own, order in zip(rows, interleave, strict=True):
         number = slices.slice_index[own]
-        time = np.argsort(acquisition_order(int(number.max()) + 1, order or 1))[number]
+        time = place_in_time(int(number.max()) + 1, order or 1)[number]
         first = np.argsort(time)
         own, time = own[first], time[first]
         about_middle = shift[own] - np.cross(turn[own], center[own])

@@ -39,11 +39,14 @@ class SlicePicture:
     difference: str
 
 
-def worst_first(rows: SliceRows, n: int = MAX_SHOWN) -> NDArray[np.int64]:
-    """Indices of the `n` slices to look at: lowest weight, then lowest correlation; small slices after the others."""
+def worst_first(rows: SliceRows) -> NDArray[np.int64]:
+    """Indices of the `MAX_SHOWN` slices to look at.
+
+    Those of the lowest weight come first, then those of the lowest correlation; small slices after the others.
+    """
     small = np.array(["small" in reason for reason in rows.reason], dtype=bool)
     kind = np.where(rows.weight >= FULL_WEIGHT, 2, small)
-    return np.lexsort((rows.ncc, np.round(rows.weight, 2), kind))[:n]
+    return np.lexsort((rows.ncc, np.round(rows.weight, 2), kind))[:MAX_SHOWN]
 
 
 def slice_pictures(slices: Slices, rows: SliceRows, names: list[str], volume: Volume) -> list[SlicePicture]:

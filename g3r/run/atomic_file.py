@@ -12,13 +12,11 @@ from g3r.run.process_mark import is_left_over, process_mark
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path to write to; it becomes `path` when the block ends well, and is removed otherwise.
 
     Args:
         path: file to write; an earlier one is replaced.
-        durable: wait until the data are on the disk before the rename, so that a crash of the machine or a full
-            disk cannot leave a file that is cut off.
 
     Raises:
         OSError: the file cannot be written or renamed.
@@ -29,8 +27,6 @@ def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Itera
     temporary = path.with_name(f".{process_mark()}-{uuid4().hex[:8]}.{path.name}")
     try:
         yield temporary
-        if durable:
-            sync(temporary)
         os.replace(temporary, path)
     finally:
         with suppress(OSError):

@@ -10,7 +10,7 @@ from scipy.ndimage import center_of_mass
 
 from data_synth.atlas import TruthVolume
 from data_synth.mask_head import SceneHead, filled_head, scene_head
-from data_synth.mask_labels import Tissue, draw_intensities
+from data_synth.mask_labels import Tissue, draw_intensities, textured
 from data_synth.mask_slicing import image_slices
 from data_synth.mask_surroundings import Surroundings, draw_surroundings
 from g3r.acquisition.file_axes import AS_IN_FILE
@@ -52,7 +52,7 @@ def surrounded(case: SimulatedCase, seed: int) -> list[Stack]:
     around = draw_surroundings(head.base_mm, head.radius_mm, rng)
     mean, texture = draw_intensities(rng)
     shells = _without_brain(head, truth, mean, texture)
-    behind = _intensities(around.labels, around.texture, mean, texture)
+    behind = textured(around.labels, around.texture, mean, texture)
     own = np.zeros_like(shells)
     own[_box(head, truth)] = np.stack([truth.data * truth.mask, truth.mask, truth.mask], -1)
     return [_in_scene(case, n, middle_mm, head, (shells, own), around, behind) for n in range(len(case.stacks))]
@@ -72,7 +72,7 @@ def _without_brain(
     brain[_box(head, truth)] = truth.mask
     shells = np.zeros((*head.labels.shape, 3), np.float32)
     fluid = np.where(head.labels == Tissue.BRAIN, Tissue.CSF, head.labels)  # clefts of the truth's mask
-    shells[..., 0] = np.where(brain, 0, _intensities(fluid, head.texture, mean, texture))
+    shells[..., 0] = np.where(brain, 0, textured(fluid, head.texture, mean, texture))
     shells[..., 1] = head.labels > 0
     shells[..., 2] = brain
     return shells
@@ -172,9 +172,3 @@ def _slice_poses(stack: Stack) -> RigidPose:
     n_i, n_j, n_slices = stack.image.shape
     index = np.stack([np.full(n_slices, (n_i - 1) / 2), np.full(n_slices, (n_j - 1) / 2), np.arange(n_slices)], axis=1)
     return RigidPose(np.broadcast_to(stack.grid.plane_frame, (n_slices, 3, 3)), stack.grid.world(index))
-
-
-def _intensities(
-    labels: NDArray[np.integer], noise: NDArray[np.float32], mean: NDArray[np.float32], texture: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    return np.maximum(mean[labels] + (mean * texture)[labels] * noise, 0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.interleave import acquisition_order
+from g3r.acquisition.interleave import acquisition_order, place_in_time
 from g3r.evaluation.pose_error import PoseTable, SliceKey
 from studies.tables import new_figure, save_figure
 
@@ -43,29 +43,19 @@ SHOWN = ("headers", "best start", "segments", "slices", "joint")
 OTHER_COLOURS = ("#000000", "#7f3c8d", "#3969ac")
 
 
-def places_in_time(n_slices: int, interleave: int = INTERLEAVE) -> NDArray[np.int64]:
-    """Acquisition rank of each slice of a stack [n_slices]."""
-    place = np.empty(n_slices, np.int64)
-    place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
-    return place
-
-
-def jerk_slices(
-    true: PoseTable, points_mm: Mapping[SliceKey, NDArray[np.float64]], interleave: int = INTERLEAVE
-) -> list[list[int]]:
+def jerk_slices(true: PoseTable, points_mm: Mapping[SliceKey, NDArray[np.float64]]) -> list[list[int]]:
     """Stack and acquisition rank of each first slice after a jerk, by the true poses.
 
     Args:
         true: the true poses.
         points_mm: [P, 3] points of each slice.
-        interleave: of the stacks.
     """
     jerks = []
     for stack in sorted({n for n, _ in true.keys}):
         rows = {k: row for row, (n, k) in enumerate(true.keys) if n == stack}
         head = np.concatenate([p for (n, _), p in points_mm.items() if n == stack])
         head = head[:: max(1, len(head) // 200)]
-        in_time = true.pose.take([rows[k] for k in acquisition_order(len(rows), interleave).tolist()])
+        in_time = true.pose.take([rows[k] for k in acquisition_order(len(rows), INTERLEAVE).tolist()])
         there = in_time.apply(np.broadcast_to(head, (len(rows), *head.shape)))
         step_mm = np.linalg.norm(np.diff(there, axis=0), axis=2).mean(1)
         bound = max(JERK_MM, JERK_RATIO * float(np.median(step_mm)))
@@ -73,13 +63,12 @@ def jerk_slices(
     return jerks
 
 
-def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = INTERLEAVE) -> None:
+def draw_slice_errors(cases: Mapping[str, Any], path: Path) -> None:
     """Draw the slice errors measured by `studies.motion.layers`, a panel per case, and write them as PNG.
 
     Args:
         cases: rows of its record.
         path: PNG to write.
-        interleave: of the stacks.
     """
     n_rows = (len(cases) + 1) // 2
     figure = new_figure((12, 2.9 * n_rows + 0.7))
@@ -97,7 +86,7 @@ def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = IN
         for number, (layer, figures) in enumerate(case["layers"].items()):
             if layer in COLOURS and layer not in SHOWN:
                 continue
-            x, y = _dots(figures["per_slice_mm"], start, width, interleave)
+            x, y = _dots(figures["per_slice_mm"], start, width)
             colour = COLOURS.get(layer, OTHER_COLOURS[number % len(OTHER_COLOURS)])
             legend[layer] = axis.scatter(
                 x, np.maximum(y, MIN_SHOWN_MM), s=9, color=colour, linewidths=0, label=layer, zorder=2
@@ -129,8 +118,8 @@ def _stack_starts(n_slices: Sequence[int]) -> list[int]:
 
 
 def _dots(
-    per_slice_mm: Sequence[Sequence[float]], start: Sequence[int], n_slices: Sequence[int], interleave: int
+    per_slice_mm: Sequence[Sequence[float]], start: Sequence[int], n_slices: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    place = [places_in_time(n, interleave) for n in n_slices]
+    place = [place_in_time(n, INTERLEAVE) for n in n_slices]
     x = [start[int(n)] + place[int(n)][int(k)] for n, k, _ in per_slice_mm]
     return np.array(x, dtype=np.float64), np.array([error for *_, error in per_slice_mm])

@@ -118,12 +118,10 @@ def limited(one: Configuration, folder: Path) -> Row:
     return {"limited": _limited_rows(case, name, _arguments_for(one, case, output), output)}
 
 
-def _limited_rows(
-    case: SimulatedCase, name: str, arguments: Sequence[str], output: Path, shares: Sequence[float] = SHARES
-) -> list[Row]:
+def _limited_rows(case: SimulatedCase, name: str, arguments: Sequence[str], output: Path) -> list[Row]:
     """A row without a limit, and one for each limit."""
     first = _row(case, name, arguments, output, None)
-    limits = [round(share * first["stated_bytes"]) for share in shares]
+    limits = [round(share * first["stated_bytes"]) for share in SHARES]
     return [first, *[_row(case, name, arguments, output, limit) for limit in limits]]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from g3r.acquisition.interleave import acquisition_order
+from g3r.acquisition.interleave import acquisition_order, place_in_time
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,8 @@ def test_every_slice_is_taken_once(n_slices: int, interleave: int) -> None:
 def test_an_interleave_below_one_is_refused() -> None:
     with pytest.raises(ValueError, match="interleave 0"):
         acquisition_order(5, 0)
+
+
+@pytest.mark.parametrize("interleave", [1, 2, 3])
+def test_places_in_time_are_the_inverse_of_the_order(interleave: int) -> None:
+    assert place_in_time(7, interleave)[acquisition_order(7, interleave)].tolist() == list(range(7))

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from g3r.acquisition.interleave import place_in_time
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose
 from g3r.planning.presets import PRESETS, changed
 from studies.motion import bias, crossing, layers, sweep
-from studies.motion.figure import draw_slice_errors, jerk_slices, places_in_time
+from studies.motion.figure import INTERLEAVE, draw_slice_errors, jerk_slices
 
 SETTINGS = {"preset": "balanced", "jobs": 1, "threads": 2}
 
@@ -98,7 +99,7 @@ def test_variants_are_settings_that_exist(variants: dict[str, dict[str, Any]]) -
 
 def test_jerks_are_found_in_the_order_of_time() -> None:
     """Ten slices in the order 0 2 4 6 8 1 3 5 7 9; the head jumps by 5 mm before slice 8."""
-    place = places_in_time(10)
+    place = place_in_time(10, INTERLEAVE)
     assert place.tolist() == [0, 5, 1, 6, 2, 7, 3, 8, 4, 9]
     shift = np.zeros((10, 3))
     shift[:, 0] = 0.1 * place + 5.0 * (place >= 4)
