@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.kernels import fill_plane_and_uv, fill_world
+from g3r.acquisition.psf import FWHM_PER_SIGMA, IN_PLANE_FWHM_PIXELS
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
@@ -198,8 +199,13 @@ class Slices:
 
     @property
     def typical_pixel_mm(self) -> float:
-        """Cube root of the median volume that a pixel covers."""
-        return float(np.median(self.pixel_volume_mm3)) ** (1 / 3)
+        """Cube root of the median volume that a pixel covers, before the scanner interpolated it to smaller ones.
+
+        Its size is that of the narrower in-plane PSF, which is wider than nominal where both axes were interpolated.
+        """
+        pixels = np.sqrt(self.planes.psf_var_mm2[:, :2]) * FWHM_PER_SIGMA / self.planes.spacing_mm
+        interpolation = np.maximum(1, np.round(pixels.min(1) / IN_PLANE_FWHM_PIXELS, 3))
+        return float(np.median(self.pixel_volume_mm3 * interpolation**2)) ** (1 / 3)
 
     @cached_property
     def pixel_index(self) -> NDArray[np.int64]:

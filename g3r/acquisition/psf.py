@@ -26,7 +26,7 @@ def psf_variance_mm2(
     Args:
         spacing_mm: [..., 2] in-plane pixel spacing.
         thickness_mm: [...] slice thickness (not the distance of slices: there are gaps).
-        in_plane_fwhm_pixels: one number, or [..., 2] of each axis, see `phase_fwhm_pixels`.
+        in_plane_fwhm_pixels: one number, or [..., 2] of each axis, see `partial_fwhm_pixels`.
 
     Returns:
         [..., 3] in mm^2.
@@ -41,14 +41,14 @@ def psf_variance_mm2(
     return (fwhm_mm / FWHM_PER_SIGMA) ** 2
 
 
-def phase_fwhm_pixels(phase_resolution: float) -> float:
-    """In-plane FWHM in pixels along the phase-encoding axis: 1.2 / p.
+def partial_fwhm_pixels(filled_share: float) -> float:
+    """In-plane FWHM in pixels along an axis of k-space that was filled in part: 1.2 / p.
 
     With pixels of d mm, k-space is filled up to p / (2 d) along this axis and zero beyond. So the image of a point is
     sin(pi p x / d) / (pi p x / d). Its main lobe is half as high at x = 0.603 d / p: its FWHM is 1.207 d / p. For
     p = 1 these are the nominal 1.2 pixels, and the Gaussian's FWHM grows with 1 / p as that of the lobe does.
 
     Args:
-        phase_resolution: p, the share of k-space that was filled, above 0 and up to 1.
+        filled_share: p, above 0 and up to 1: the phase resolution, or what interpolation to smaller pixels left.
     """
-    return IN_PLANE_FWHM_PIXELS / phase_resolution
+    return IN_PLANE_FWHM_PIXELS / filled_share

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g3r.acquisition.psf import IN_PLANE_FWHM_PIXELS, phase_fwhm_pixels
+from g3r.acquisition.psf import IN_PLANE_FWHM_PIXELS, partial_fwhm_pixels
 from g3r.acquisition.sidecar import AXES, Axis, Sidecar, read_sidecar, sidecar_path
 from g3r.errors import InputError
 
@@ -33,11 +33,14 @@ class ProfileOrigin:
 
     Attributes:
         thickness_from: source of the thickness.
-        phase_resolution: share of k-space that was filled along the phase-encoding axis; None: not known.
+        filled_share: of k-space, along the two axes of the slices' images, by their spectrum; None: it shows no end.
+        phase_resolution: share of k-space that was filled along the phase-encoding axis, by the sidecar; None: not
+            known.
         phase_axis: the phase-encoding axis of the image file; None: not known.
     """
 
     thickness_from: ThicknessSource = "option"
+    filled_share: tuple[float | None, float | None] = (None, None)
     phase_resolution: float | None = None
     phase_axis: Axis | None = None
 
@@ -66,6 +69,8 @@ class SliceProfile:
         p, axis = self.origin.phase_resolution, self.origin.phase_axis
         if self.in_plane_fwhm_pixels != NOMINAL_FWHM_PIXELS:
             text += ", in-plane FWHM {:.3g} x {:.3g} pixels".format(*self.in_plane_fwhm_pixels)
+        if self.origin.filled_share != (None, None):
+            text += ", k-space filled to {:g} x {:g}".format(*(share or 1 for share in self.origin.filled_share))
         if p is not None and p < 1:
             text += f", phase resolution {p:g} " + (f"along {axis}" if axis else "of an unknown axis, not used")
         return text
@@ -77,6 +82,7 @@ def find_slice_profile(
     slice_axis: int,
     thickness_mm: float | None = None,
     earlier: SliceProfile | None = None,
+    filled_share: tuple[float | None, float | None] = (None, None),
 ) -> SliceProfile:
     """The profile of a stack's slices; a line about it is logged.
 
@@ -85,7 +91,8 @@ def find_slice_profile(
         spacing_mm: [3] along the axes of the file.
         slice_axis: the axis of the file, 0 to 2, along which slices are counted.
         thickness_mm: the user's; it wins over everything else.
-        earlier: profile of the run that is repeated, in place of the sidecar's.
+        earlier: profile of the run that is repeated, in place of the sidecar's and the spectrum's.
+        filled_share: of k-space by the spectrum of the images, see `ProfileOrigin`; it wins over the sidecar's.
 
     Raises:
         InputError: a sidecar that cannot be used, or one with another slice spacing than the image's.
@@ -96,7 +103,8 @@ def find_slice_profile(
         sidecar = read_sidecar(sidecar_path(path))
         if sidecar is not None:
             _check_slice_spacing(sidecar, slice_spacing_mm, name)
-        profile = _profile(*_thickness(sidecar, slice_spacing_mm, thickness_mm, name), sidecar, slice_axis)
+        thickness_mm, source = _thickness(sidecar, slice_spacing_mm, thickness_mm, name)
+        profile = _profile(thickness_mm, source, sidecar, slice_axis, filled_share)
     elif thickness_mm is None:
         profile = earlier
     else:
@@ -148,31 +156,43 @@ def _thickness(
     return (slice_spacing_mm, "spacing") if said_mm is None else (said_mm, "sidecar")
 
 
-def _profile(thickness_mm: float, source: ThicknessSource, sidecar: Sidecar | None, slice_axis: int) -> SliceProfile:
-    """The profile, wider along the phase-encoding axis where the sidecar knows it.
+def _profile(
+    thickness_mm: float,
+    source: ThicknessSource,
+    sidecar: Sidecar | None,
+    slice_axis: int,
+    filled_share: tuple[float | None, float | None],
+) -> SliceProfile:
+    """The profile, wider in plane where spectrum or sidecar say that k-space was filled in part.
 
     Args:
         thickness_mm: of a slice.
         source: of the thickness.
         sidecar: None if there is none.
         slice_axis: of the file.
+        filled_share: see `find_slice_profile`.
     """
-    if sidecar is None:
-        return SliceProfile(thickness_mm=thickness_mm, origin=ProfileOrigin(thickness_from=source))
-    axis = sidecar.phase_axis_of(slice_axis)
-    if axis is not None and AXES.index(axis) == slice_axis:
-        # slices that are excited one by one are encoded in their plane: the file or its axes were changed
-        if sidecar.phase_resolution is not None:
-            logger.warning("%s: phase encoding along %s, which counts the slices; it is not used", sidecar.name, axis)
-        axis = None
-    fwhm = list(NOMINAL_FWHM_PIXELS)
-    if axis is not None and sidecar.phase_resolution is not None:
-        in_plane = [letter for n, letter in enumerate(AXES) if n != slice_axis]
-        fwhm[in_plane.index(axis)] = phase_fwhm_pixels(sidecar.phase_resolution)
+    share = list(filled_share)
+    phase_resolution, axis = None, None
+    if sidecar is not None:
+        phase_resolution, axis = sidecar.phase_resolution, sidecar.phase_axis_of(slice_axis)
+        if axis is not None and AXES.index(axis) == slice_axis:
+            # slices that are excited one by one are encoded in their plane: the file or its axes were changed
+            if phase_resolution is not None:
+                logger.warning(
+                    "%s: phase encoding along %s, which counts the slices; it is not used", sidecar.name, axis
+                )
+            axis = None
+        if axis is not None:
+            place = [letter for n, letter in enumerate(AXES) if n != slice_axis].index(axis)
+            share[place] = share[place] or phase_resolution
+    first, second = (partial_fwhm_pixels(one or 1.0) for one in share)
     return SliceProfile(
         thickness_mm=thickness_mm,
-        in_plane_fwhm_pixels=(fwhm[0], fwhm[1]),
-        origin=ProfileOrigin(thickness_from=source, phase_resolution=sidecar.phase_resolution, phase_axis=axis),
+        in_plane_fwhm_pixels=(first, second),
+        origin=ProfileOrigin(
+            thickness_from=source, filled_share=filled_share, phase_resolution=phase_resolution, phase_axis=axis
+        ),
     )
 
 

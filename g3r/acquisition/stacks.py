@@ -15,6 +15,7 @@ from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
 from g3r.acquisition.cut_images import mask_of_content
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
+from g3r.acquisition.k_space_extent import filled_share
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
 from g3r.acquisition.stack_checks import check_arrays, check_grid, check_intensities, check_profile, spaced
 from g3r.errors import InputError
@@ -153,7 +154,9 @@ def load_stack(
     axes = FileAxes.of(volume.grid)
     grid = settled(axes.grid_from_file(volume.grid))
     spacing = axes.grid_to_file(grid).spacing_mm
-    profile = find_slice_profile(path, spacing, axes.slice_axis, thickness_mm, profile)
+    image, inside = axes.from_file(volume.data), axes.from_file(found.inside)
+    filled = (filled_share(image, 0), filled_share(image, 1))
+    profile = find_slice_profile(path, spacing, axes.slice_axis, thickness_mm, profile, filled)
     remarks = list(volume.remarks)
     if found.source != "whole image" and found.inside.all():
         remarks.append("its mask marks every voxel; expected the brain alone")
@@ -163,7 +166,6 @@ def load_stack(
         remarks.append(f"thickness {profile.thickness_mm:g} mm is less than the pixels' {pixels} mm; check --thickness")
     for remark in remarks:
         logger.warning("%s: %s", volume.name, remark)
-    image, inside = axes.from_file(volume.data), axes.from_file(found.inside)
     mask_shown = mask_of_content(image, inside)
     if n_zero := np.count_nonzero(inside) - np.count_nonzero(mask_shown):
         share = n_zero / np.count_nonzero(inside)

@@ -29,7 +29,9 @@ class StackRecord:
         thickness_mm, thickness_from: slice thickness and its source: the option, the sidecar, or, if unknown, assumed
             equal to the slice spacing ("spacing").
         in_plane_fwhm_pixels: width of the PSF along the two axes of a slice.
-        phase_resolution, phase_axis: they determine the in-plane width; None if the scanner does not state them.
+        filled_share: of k-space, along the two axes of a slice, by the spectrum of its images; None where it shows no
+            end. It determines the in-plane width, or else phase_resolution and phase_axis do.
+        phase_resolution, phase_axis: None if the scanner does not state them.
         spacing_mm: distances of pixels and of slices.
         mask_from, mask_detail: source of the mask, and details of how it was made.
         mask_ml: volume of the mask.
@@ -44,6 +46,7 @@ class StackRecord:
     thickness_mm: float
     thickness_from: ThicknessSource = "option"
     in_plane_fwhm_pixels: tuple[float, ...] = NOMINAL_FWHM_PIXELS
+    filled_share: tuple[float | None, ...] = (None, None)
     phase_resolution: float | None = None
     phase_axis: Axis | None = None
     spacing_mm: list[float] = field(default_factory=list)
@@ -63,16 +66,22 @@ class StackRecord:
         """The PSF, for use in another run.
 
         Raises:
-            InputError: the record was edited and does not have two in-plane widths.
+            InputError: the record was edited and does not have two in-plane widths or filled shares.
         """
         if len(self.in_plane_fwhm_pixels) != 2:
             raise InputError(f"{self.name}: has {len(self.in_plane_fwhm_pixels)} in-plane widths; expected 2")
         first, second = self.in_plane_fwhm_pixels
+        if len(self.filled_share) != 2:
+            raise InputError(f"{self.name}: has {len(self.filled_share)} filled shares; expected 2")
+        along_first, along_second = self.filled_share
         return SliceProfile(
             thickness_mm=self.thickness_mm,
             in_plane_fwhm_pixels=(first, second),
             origin=ProfileOrigin(
-                thickness_from=self.thickness_from, phase_resolution=self.phase_resolution, phase_axis=self.phase_axis
+                thickness_from=self.thickness_from,
+                filled_share=(along_first, along_second),
+                phase_resolution=self.phase_resolution,
+                phase_axis=self.phase_axis,
             ),
         )
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from g3r.acquisition.brain_mask import whole_image
-from g3r.acquisition.psf import FWHM_PER_SIGMA, phase_fwhm_pixels, psf_variance_mm2
+from g3r.acquisition.psf import FWHM_PER_SIGMA, partial_fwhm_pixels, psf_variance_mm2
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, ProfileOrigin, SliceProfile
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack, load_stacks
@@ -125,7 +125,7 @@ def test_the_width_is_that_of_the_lobe_of_a_k_space_filled_in_part(p: float) -> 
     x = np.arange(-200_000, 200_001) * 1e-5  # pixels
     lobe = np.sinc(p * x) >= 0.5
     fwhm = np.ptp(x[lobe & (np.abs(p * x) < 1)])
-    assert phase_fwhm_pixels(p) == pytest.approx(fwhm, rel=0.01)
+    assert partial_fwhm_pixels(p) == pytest.approx(fwhm, rel=0.01)
 
 
 def test_variances_follow_the_widths_of_the_axes() -> None:
@@ -232,8 +232,14 @@ def test_real_sidecars_are_read(real: list[Path], caplog: pytest.LogCaptureFixtu
     assert [stack.thickness_mm for stack in stacks] == [3.0] * 3
     assert [stack.origin.phase_axis for stack in stacks] == ["i", "j", "i"]
     assert all(stack.origin.thickness_from == "sidecar" for stack in stacks)
-    assert stacks[0].in_plane_fwhm_pixels == stacks[2].in_plane_fwhm_pixels == (WIDE, 1.2)
-    assert stacks[1].in_plane_fwhm_pixels == (1.2, WIDE)
+    assert [stack.origin.phase_resolution for stack in stacks] == [P] * 3
+    for stack, phase_axis in zip(stacks, (0, 1, 0), strict=True):
+        # the spectrum ends there, too; the scanner's filter takes a tenth
+        share = stack.origin.filled_share
+        assert share[phase_axis] == pytest.approx(0.9 * P, abs=0.02)
+        assert share[1 - phase_axis] is None
+        assert stack.in_plane_fwhm_pixels[phase_axis] == pytest.approx(1.2 / share[phase_axis])
+        assert stack.in_plane_fwhm_pixels[1 - phase_axis] == 1.2
     assert not caplog.messages
 
 
