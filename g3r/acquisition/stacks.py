@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
-from g3r.acquisition.cut_images import mask_of_content
+from g3r.acquisition.cut_images import mask_of_content, without_residue
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
@@ -35,7 +35,8 @@ class Stack:
     """Parallel slices with one header.
 
     Args:
-        image: [I, J, K] float32, arbitrary units; K counts the slices.
+        image: [I, J, K] float32, arbitrary units; K counts the slices. What is nearly zero becomes zero
+            (`without_residue`).
         mask: [I, J, K] bool, the brain.
         affine: [4, 4] float64, RAS+ mm from index; may be left-handed or oblique.
         thickness_mm: thickness of a slice; the slice spacing is in the affine and may differ.
@@ -74,6 +75,7 @@ class Stack:
         affine = np.array(self.affine, dtype=np.float64)
         widths = tuple(float(width) for width in self.in_plane_fwhm_pixels)
         check_arrays(image, mask, self.name)
+        image = without_residue(image)  # what was set to zero is zero from here on, also for the checks
         check_grid(image.shape, affine, self.name)
         check_profile(self.thickness_mm, widths, self.name)
         check_intensities(image, mask, self.name)
@@ -163,7 +165,7 @@ def load_stack(
         remarks.append(f"thickness {profile.thickness_mm:g} mm is less than the pixels' {pixels} mm; check --thickness")
     for remark in remarks:
         logger.warning("%s: %s", volume.name, remark)
-    image, inside = axes.from_file(volume.data), axes.from_file(found.inside)
+    image, inside = without_residue(axes.from_file(volume.data)), axes.from_file(found.inside)
     mask_shown = mask_of_content(image, inside)
     if n_zero := np.count_nonzero(inside) - np.count_nonzero(mask_shown):
         share = n_zero / np.count_nonzero(inside)
