@@ -215,25 +215,35 @@ def load_stacks(
     ):
         stack = load_stack(path, mask, own_mm, profile, name)
         for other, other_path in zip(stacks, paths, strict=False):
-            _check_pair(stack, other, Path(path), Path(other_path))
+            if Path(path).resolve() == Path(other_path).resolve():
+                raise InputError(f"{stack.name}: is given twice; pass each stack once")
+            _check_pair(stack, other, stack.name, other.name)
         stacks.append(stack)
     return stacks
 
 
-def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> None:
+def check_together(stacks: Sequence[Stack]) -> None:
+    """Check that stacks can be of one head; `load_stacks` has done so with files.
+
+    Raises:
+        InputError: the same image twice, which would count twice, or stacks too far apart.
+    """
+    told = names_of([stack.name for stack in stacks])
+    for n, stack in enumerate(stacks):
+        for m in range(n):
+            _check_pair(stack, stacks[m], told[n], told[m])
+
+
+def _check_pair(stack: Stack, other: Stack, name: str, other_name: str) -> None:
     """Raise `InputError` for one image given twice, which would count twice, and for heads too far apart."""
-    if path.resolve() == other_path.resolve():
-        raise InputError(f"{stack.name}: is given twice; pass each stack once")
     # compared with the axes of the files: with another header, the rows of a copy are turned
     if np.array_equal(stack.axes.to_file(stack.image), other.axes.to_file(other.image)):
-        raise InputError(
-            f"{stack.name}: holds the same image as {other.name}; pass each stack once, and copies not at all"
-        )
+        raise InputError(f"{name}: holds the same image as {other_name}; pass each stack once, and copies not at all")
     apart_mm = float(np.linalg.norm(_middle_mm(stack) - _middle_mm(other)))
     if apart_mm > FARTHEST_MM:
         raise InputError(
-            f"{stack.name}: is {apart_mm:.0f} mm from {other.name} by its header; expected scans of one "
-            "head in one session, fix the header or omit the stack"
+            f"{name}: is {apart_mm:.0f} mm from {other_name} by its header; expected scans of one head in one "
+            "session, fix the header or omit the stack"
         )
 
 
