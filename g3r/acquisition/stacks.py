@@ -15,6 +15,7 @@ from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
 from g3r.acquisition.cut_images import mask_of_content, without_residue
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
+from g3r.acquisition.slice_axis import find_slice_axis
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
 from g3r.acquisition.stack_checks import check_arrays, check_grid, check_intensities, check_profile, spaced
 from g3r.errors import InputError
@@ -126,8 +127,8 @@ def load_stack(
 ) -> Stack:
     """Read a stack and its mask, and its JSON sidecar where there is one.
 
-    The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third. Image, mask and
-    affine are turned together so that it becomes the last axis and rows have one order (`FileAxes`). Slices keep their
+    The slice axis is found by `find_slice_axis`. Image, mask and affine are turned together so that it becomes the
+    last axis and rows have one order (`FileAxes`). Slices keep their
     numbers. Zeros around an extracted brain are no part of a mask (`mask_of_content`). The affine is rounded; no point
     within 120 mm of the middle moves by more than 0.02 mm (`settled`).
 
@@ -152,11 +153,12 @@ def load_stack(
         found = mask(volume)
     else:
         found = FoundMask(inside=load_mask(mask, volume), source="file")
-    axes = FileAxes.of(volume.grid)
+    across = find_slice_axis(path, volume.grid.spacing_mm)
+    axes = FileAxes.of(volume.grid, across.axis)
     grid = settled(axes.grid_from_file(volume.grid))
     spacing = axes.grid_to_file(grid).spacing_mm
     profile = find_slice_profile(path, spacing, axes.slice_axis, thickness_mm, profile)
-    remarks = list(volume.remarks)
+    remarks = [*volume.remarks, *([across.remark] if across.remark else [])]
     if found.source != "whole image" and found.inside.all():
         remarks.append("its mask marks every voxel; expected the brain alone")
     pixel_mm = grid.spacing_mm[:2]  # of the slices, whichever axis of the file they are along
