@@ -15,7 +15,7 @@ there, or a few where they have no noise, since these pixels are partly brain; m
 share of a rectangle that must not be zero for it to be a field of view."""
 
 NEARLY_ZERO = 1e-3
-"""Share of the median in the mask below which a pixel was set to zero, and perhaps resampled since."""
+"""Share of the median of tissue (in the mask) below which a pixel was set to zero, and perhaps resampled since."""
 
 FEW = 0.01
 """Share of zeros in a mask that noise or rounding may leave."""
@@ -46,7 +46,7 @@ def without_residue(image: NDArray[np.float32]) -> NDArray[np.float32]:
     limit = NEARLY_ZERO * typical
     empty = np.abs(image) <= limit
     dark = image[np.abs(image) <= DARK * typical]
-    level = np.median(dark) if dark.size else np.float32(0)
+    level = np.median(dark) if dark.size > FEW * image.size else np.float32(0)
     if 0 < abs(level) <= SMALL * typical and np.mean(np.abs(dark - level) <= limit) > MOSTLY:
         empty |= np.abs(image - level) <= limit
     return np.where(empty, np.float32(0), image)

@@ -107,6 +107,9 @@ def test_noise_is_no_residue() -> None:
         for image in (sizes.astype(np.float32), np.rint(sizes).astype(np.float32)):
             changed = without_residue(image) != image
             assert changed.mean() < 0.001
+    spots = 10 * brain(100.0)
+    spots[:3, 0, 0] = 3.0  # a few dark pixels of one value are no background
+    np.testing.assert_array_equal(without_residue(spots), spots)
     empty = np.zeros(SHAPE, np.float32)
     np.testing.assert_array_equal(without_residue(empty), empty)
     np.testing.assert_array_equal(without_residue(np.full(SHAPE, np.nan, np.float32)), np.full(SHAPE, np.nan))
