@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from g3r.acquisition.intensity_levels import level_notes, same_level
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
-from g3r.acquisition.stacks import Stack
+from g3r.acquisition.stacks import Stack, check_together
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.fitting.fit_context import FitContext
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
@@ -85,12 +85,13 @@ class GaussianReconstructor:
                 (`record.partial`); else `KeyboardInterrupt` passes through.
 
         Raises:
-            InputError: stacks that cannot be used, or a registration of other slices.
+            InputError: stacks that cannot be used (see `check_together`), or a registration of other slices.
             NumericalError: a fit that broke down.
         """
         plan, run = plan or FixedPlan(self.settings), run or RunContext()
         if plan.settings.use_prior:
             self.networks.start()  # their libraries are imported while poses are found
+        check_together(stacks)
         stacks = same_level(stacks)
         slices, intensity = normalised_slices(stacks)
         run.notes += level_notes(stacks) + skipped_slice_notes(stacks, slices)
@@ -122,8 +123,9 @@ class GaussianReconstructor:
         """Poses of all slices of some stacks, as `reconstruct` estimates them and accepts them as its argument.
 
         Raises:
-            InputError: stacks that cannot be used.
+            InputError: stacks that cannot be used (see `check_together`).
         """
+        check_together(stacks)
         return self.register(normalised_slices(same_level(stacks))[0])
 
     def register(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from g3r.acquisition.cut_images import without_residue
 from g3r.acquisition.images import Volume
 from g3r.errors import InputError
 from g3r.run.provenance import FileHash
@@ -54,7 +55,7 @@ def empty_background_mask(volume: Volume) -> FoundMask | None:
     Args:
         volume: of a stack.
     """
-    value = np.nan_to_num(volume.data)
+    value = _cleared(volume)
     positive = value > 0
     if np.count_nonzero(value == 0) <= MIN_ZERO_SHARE * value.size or not positive.any():
         return None
@@ -67,12 +68,12 @@ def empty_background_mask(volume: Volume) -> FoundMask | None:
 
 
 def whole_image(volume: Volume) -> FoundMask:
-    """A mask of every positive voxel.
+    """A mask of every positive voxel that is not nearly zero.
 
     Raises:
         InputError: no voxel is positive.
     """
-    positive = np.nan_to_num(volume.data) > 0
+    positive = _cleared(volume) > 0
     if not positive.any():
         raise InputError(f"{volume.name}: no positive value; expected an image")
     return FoundMask(inside=positive, source="whole image")
@@ -86,10 +87,15 @@ def required_mask(volume: Volume) -> FoundMask:
     """
     found = empty_background_mask(volume)
     if found is None:
-        zeros = 100 * float(np.mean(np.nan_to_num(volume.data) == 0))
+        zeros = 100 * float(np.mean(_cleared(volume) == 0))
         raise InputError(
             f"{volume.name}: no mask says what is to be reconstructed, and the image shows more than that "
             f"({zeros:.0f} % of the voxels are zero; expected over {100 * MIN_ZERO_SHARE:.0f} % and a rest of "
             f"{BRAIN_RANGE_ML[0]:g} to {BRAIN_RANGE_ML[1]:g} ml); {WAYS_ON}"
         )
     return found
+
+
+def _cleared(volume: Volume) -> NDArray[np.float32]:
+    """Values [I, J, K] of an image with zeros for what is nearly zero or not a number."""
+    return np.nan_to_num(without_residue(volume.data))

@@ -15,10 +15,41 @@ there, or a few where they have no noise, since these pixels are partly brain; m
 share of a rectangle that must not be zero for it to be a field of view."""
 
 NEARLY_ZERO = 1e-3
-"""Share of the median in the mask below which a pixel was set to zero, and perhaps resampled since."""
+"""Share of the median of tissue (in the mask) below which a pixel was set to zero, and perhaps resampled since."""
 
 FEW = 0.01
 """Share of zeros in a mask that noise or rounding may leave."""
+
+TOP_PERCENTILE, SMALL = 99.9, 0.01
+"""Values below this share of a high percentile are no tissue. An extracted brain may be half a percent of its image, so
+that the 99th percentile would be of its background."""
+
+DARK = 0.05
+"""Share of the median of tissue below which noise has many values, also in few grey levels, and a constant one."""
+
+
+def without_residue(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image with zeros where it is nearly zero, as interpolation or stored offsets leave what was set to zero.
+
+    Nearly zero is below `NEARLY_ZERO` of the median of tissue. So is a constant up to `SMALL` of it, which the offset
+    of a header (scl_inter) leaves, if hardly another value is dark: noise has many.
+
+    Args:
+        image: of any shape, arbitrary units; what is not finite stays.
+    """
+    size = np.abs(image[np.isfinite(image)])
+    # "lower", since the mean of two very large numbers would overflow
+    top = np.percentile(size, TOP_PERCENTILE, method="lower") if size.size else np.float32(0)
+    if top <= 0:
+        return image
+    typical = float(np.median(size[size > SMALL * top]))
+    limit = NEARLY_ZERO * typical
+    empty = np.abs(image) <= limit
+    dark = image[np.abs(image) <= DARK * typical]
+    level = np.median(dark) if dark.size > FEW * image.size else np.float32(0)
+    if 0 < abs(level) <= SMALL * typical and np.mean(np.abs(dark - level) <= limit) > MOSTLY:
+        empty |= np.abs(image - level) <= limit
+    return np.where(empty, np.float32(0), image)
 
 
 def cut_at_mask(slices: Slices) -> NDArray[np.bool_]:
@@ -50,6 +81,10 @@ def mask_of_content(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDAr
     """The mask [I, J, K] without the zeros around an image that was cut out more narrowly than its mask.
 
     Zeros that content surrounds stay, and so do slices that are zero throughout.
+
+    Args:
+        image: [I, J, K] slices along the third axis, `without_residue`.
+        mask: of the brain.
     """
     zero = (image == 0) & mask
     if zero.sum() <= FEW * mask.sum():
@@ -66,7 +101,7 @@ def field_of_view(image: NDArray[np.float32]) -> tuple[tuple[int, int], tuple[in
     All of them, unless zeros pad a rectangle of pixels that mostly are not zero.
 
     Args:
-        image: [I, J, K] slices along the third axis.
+        image: [I, J, K] slices along the third axis, `without_residue`.
     """
     whole = tuple((0, n - 1) for n in image.shape[:2])
     content = image != 0

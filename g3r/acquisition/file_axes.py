@@ -43,12 +43,16 @@ class FileAxes:
     flipped: tuple[bool, bool] = (False, False)
 
     @classmethod
-    def of(cls, grid: VolumeGrid) -> FileAxes:
-        """The axes of a file: both axes of a slice point right, to the front, or up, whichever is nearest."""
-        through = slice_axis(grid.spacing_mm)
-        axes = cls(through).grid_from_file(grid).affine[:3, :2]
+    def of(cls, grid: VolumeGrid, slice_axis: int) -> FileAxes:
+        """The axes of a file: both axes of a slice point right, to the front, or up, whichever is nearest.
+
+        Args:
+            grid: of the file.
+            slice_axis: the file's axis across the slices, 0 to 2 (`find_slice_axis`).
+        """
+        axes = cls(slice_axis).grid_from_file(grid).affine[:3, :2]
         main = axes[np.abs(axes).argmax(0), [0, 1]]
-        return cls(through, (bool(main[0] < 0), bool(main[1] < 0)))
+        return cls(slice_axis, (bool(main[0] < 0), bool(main[1] < 0)))
 
     def from_file(self, array: NDArray[Scalar]) -> NDArray[Scalar]:
         """A file's array as [I, J, K], contiguous."""
@@ -91,11 +95,6 @@ class FileAxes:
 
 AS_IN_FILE = FileAxes()
 """The axes of an array that is used as it lies in its file."""
-
-
-def slice_axis(spacing_mm: NDArray[np.float64]) -> int:
-    """The axis across the slices: the one whose spacing is clearly above the others, else the third."""
-    return int(np.argmax(spacing_mm)) if np.max(spacing_mm) > 1.1 * np.median(spacing_mm) else 2
 
 
 def settled(grid: VolumeGrid) -> VolumeGrid:

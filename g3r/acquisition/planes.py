@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.kernels import fill_plane_and_uv, fill_world
 from g3r.acquisition.psf import FWHM_PER_SIGMA, IN_PLANE_FWHM_PIXELS
+from g3r.acquisition.stack_checks import ORTHOGONALITY_TOLERANCE
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
@@ -268,10 +269,10 @@ def volume_planes(grid: VolumeGrid) -> Planes:
     """The K planes of a volume's third axis, without PSF; their pixels in order are data[:, :, k].
 
     Raises:
-        ValueError: a grid whose axes are sheared.
+        ValueError: a grid whose axes are more sheared than those of a stack may be (`ORTHOGONALITY_TOLERANCE`).
     """
-    if grid.shear > 1e-6:
-        raise ValueError("planes need a grid with orthogonal axes")
+    if grid.shear > ORTHOGONALITY_TOLERANCE:
+        raise ValueError(f"planes need a grid with orthogonal axes; these are sheared (cosine {grid.shear:.2g})")
     n_i, n_j, n_k = grid.shape
     index = np.stack([np.full(n_k, (n_i - 1) / 2), np.full(n_k, (n_j - 1) / 2), np.arange(n_k)], axis=1)
     return Planes(

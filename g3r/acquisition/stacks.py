@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
-from g3r.acquisition.cut_images import mask_of_content
+from g3r.acquisition.cut_images import mask_of_content, without_residue
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
 from g3r.acquisition.k_space_extent import filled_share
+from g3r.acquisition.slice_axis import find_slice_axis
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
 from g3r.acquisition.stack_checks import check_arrays, check_grid, check_intensities, check_profile, spaced
 from g3r.errors import InputError
@@ -36,7 +37,8 @@ class Stack:
     """Parallel slices with one header.
 
     Args:
-        image: [I, J, K] float32, arbitrary units; K counts the slices.
+        image: [I, J, K] float32, arbitrary units; K counts the slices. What is nearly zero becomes zero
+            (`without_residue`).
         mask: [I, J, K] bool, the brain.
         affine: [4, 4] float64, RAS+ mm from index; may be left-handed or oblique.
         thickness_mm: thickness of a slice; the slice spacing is in the affine and may differ.
@@ -75,6 +77,7 @@ class Stack:
         affine = np.array(self.affine, dtype=np.float64)
         widths = tuple(float(width) for width in self.in_plane_fwhm_pixels)
         check_arrays(image, mask, self.name)
+        image = without_residue(image)  # what was set to zero is zero from here on, also for the checks
         check_grid(image.shape, affine, self.name)
         check_profile(self.thickness_mm, widths, self.name)
         check_intensities(image, mask, self.name)
@@ -125,8 +128,8 @@ def load_stack(
 ) -> Stack:
     """Read a stack and its mask, and its JSON sidecar where there is one.
 
-    The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third. Image, mask and
-    affine are turned together so that it becomes the last axis and rows have one order (`FileAxes`). Slices keep their
+    The slice axis is found by `find_slice_axis`. Image, mask and affine are turned together so that it becomes the
+    last axis and rows have one order (`FileAxes`). Slices keep their
     numbers. Zeros around an extracted brain are no part of a mask (`mask_of_content`). The affine is rounded; no point
     within 120 mm of the middle moves by more than 0.02 mm (`settled`).
 
@@ -151,13 +154,14 @@ def load_stack(
         found = mask(volume)
     else:
         found = FoundMask(inside=load_mask(mask, volume), source="file")
-    axes = FileAxes.of(volume.grid)
+    across = find_slice_axis(path, volume.grid.spacing_mm)
+    axes = FileAxes.of(volume.grid, across.axis)
     grid = settled(axes.grid_from_file(volume.grid))
     spacing = axes.grid_to_file(grid).spacing_mm
-    image, inside = axes.from_file(volume.data), axes.from_file(found.inside)
+    image, inside = without_residue(axes.from_file(volume.data)), axes.from_file(found.inside)
     filled = (filled_share(image, 0), filled_share(image, 1))
     profile = find_slice_profile(path, spacing, axes.slice_axis, thickness_mm, profile, filled)
-    remarks = list(volume.remarks)
+    remarks = [*volume.remarks, *([across.remark] if across.remark else [])]
     if found.source != "whole image" and found.inside.all():
         remarks.append("its mask marks every voxel; expected the brain alone")
     pixel_mm = grid.spacing_mm[:2]  # of the slices, whichever axis of the file they are along
@@ -215,25 +219,35 @@ def load_stacks(
     ):
         stack = load_stack(path, mask, own_mm, profile, name)
         for other, other_path in zip(stacks, paths, strict=False):
-            _check_pair(stack, other, Path(path), Path(other_path))
+            if Path(path).resolve() == Path(other_path).resolve():
+                raise InputError(f"{stack.name}: is given twice; pass each stack once")
+            _check_pair(stack, other, stack.name, other.name)
         stacks.append(stack)
     return stacks
 
 
-def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> None:
+def check_together(stacks: Sequence[Stack]) -> None:
+    """Check that stacks can be of one head; `load_stacks` has done so with files.
+
+    Raises:
+        InputError: the same image twice, which would count twice, or stacks too far apart.
+    """
+    told = names_of([stack.name for stack in stacks])
+    for n, stack in enumerate(stacks):
+        for m in range(n):
+            _check_pair(stack, stacks[m], told[n], told[m])
+
+
+def _check_pair(stack: Stack, other: Stack, name: str, other_name: str) -> None:
     """Raise `InputError` for one image given twice, which would count twice, and for heads too far apart."""
-    if path.resolve() == other_path.resolve():
-        raise InputError(f"{stack.name}: is given twice; pass each stack once")
     # compared with the axes of the files: with another header, the rows of a copy are turned
     if np.array_equal(stack.axes.to_file(stack.image), other.axes.to_file(other.image)):
-        raise InputError(
-            f"{stack.name}: holds the same image as {other.name}; pass each stack once, and copies not at all"
-        )
+        raise InputError(f"{name}: holds the same image as {other_name}; pass each stack once, and copies not at all")
     apart_mm = float(np.linalg.norm(_middle_mm(stack) - _middle_mm(other)))
     if apart_mm > FARTHEST_MM:
         raise InputError(
-            f"{stack.name}: is {apart_mm:.0f} mm from {other.name} by its header; expected scans of one "
-            "head in one session, fix the header or omit the stack"
+            f"{name}: is {apart_mm:.0f} mm from {other_name} by its header; expected scans of one head in one "
+            "session, fix the header or omit the stack"
         )
 
 

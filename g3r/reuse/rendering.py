@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.images import Space, Volume
 from g3r.acquisition.nifti import MAX_VOXEL_COUNT
+from g3r.acquisition.stack_checks import ORTHOGONALITY_TOLERANCE
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.reuse.finished_run import FinishedRun
@@ -60,8 +61,11 @@ def target_grid(
         run_from_space = found
     if like is not None:
         written, evaluated = like.grid, like.grid.moved(run_from_space)
-        if written.shear > 1e-6:
-            raise InputError(f"{like.name}: its axes are sheared; pass an image with orthogonal axes")
+        if written.shear > ORTHOGONALITY_TOLERANCE:
+            raise InputError(
+                f"{like.name}: its axes are sheared (cosine {written.shear:.2g}); expected at most "
+                f"{ORTHOGONALITY_TOLERANCE:g}, pass an image with orthogonal axes"
+            )
     else:
         resolution_mm = float(run.geometry.grid.spacing_mm[0]) if resolution_mm is None else resolution_mm
         low, high = RESOLUTION_RANGE_MM

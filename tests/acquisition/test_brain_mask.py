@@ -41,16 +41,28 @@ def test_nan_around_a_brain_is_nothing_too() -> None:
     np.testing.assert_array_equal(found.inside, ball(12))
 
 
+@pytest.mark.parametrize("beyond", [1e-6, -1e-5, 1e-3, -4e-3])
+def test_nearly_nothing_around_a_brain_is_nothing_too(beyond: float) -> None:
+    """What interpolation leaves, or the offset of whole numbers; the brain has 1 to 2."""
+    volume = stack(ball(12))
+    volume.data[~ball(12)] = beyond
+    found = required_mask(volume)
+    np.testing.assert_array_equal(found.inside, ball(12))
+    assert found.source == "empty background"
+    np.testing.assert_array_equal(whole_image(volume).inside, ball(12))
+
+
 @pytest.mark.parametrize(
     "volume",
     [
         stack(ball(12), around=0.2),
+        stack(ball(12), around=0.01),
         stack(np.ones(SHAPE, bool)),
         stack(ball(3)),
         Volume(stack(ball(12)).data, np.diag([6.0, 6.0, 10.0, 1.0]), "a.nii.gz"),
         Volume(np.zeros(SHAPE, np.float32), AFFINE, "a.nii.gz"),
     ],
-    ids=["tissue around it", "no background", "too small", "too large", "nothing at all"],
+    ids=["tissue around it", "noise around it", "no background", "too small", "too large", "nothing at all"],
 )
 def test_without_a_mask_anything_else_is_refused(volume: Volume) -> None:
     assert empty_background_mask(volume) is None

@@ -76,6 +76,17 @@ def test_volume_planes_are_the_volume_in_order() -> None:
         assert (planes.psf_var_mm2 == 0).all()
 
 
+def test_axes_may_be_as_orthogonal_as_those_of_a_stack() -> None:
+    for cosine in (1e-5, 9e-4):
+        grid = VolumeGrid((5, 4, 3), affine_of(AXES["oblique"] @ (np.eye(3) + cosine * np.eye(3, k=1))))
+        assert grid.shear > 0.9 * cosine
+        index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1)
+        expected = grid.world(index).transpose(2, 0, 1, 3).reshape(-1, 3)
+        np.testing.assert_allclose(volume_planes(grid).pixel_world_mm(), expected, atol=1e-9)
+    with pytest.raises(ValueError, match=r"orthogonal axes; these are sheared \(cosine 0\.002\)"):
+        volume_planes(VolumeGrid((5, 4, 3), affine_of(np.eye(3) + 2e-3 * np.eye(3, k=1))))
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -12,6 +12,7 @@ from g3r import GaussianReconstructor
 from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
 from g3r.planning.presets import PRESETS, ReconstructionSettings
+from tests.acquisition.nifti_files import stacks_of_two
 from tests.cli.test_infer import files, inputs, run
 
 
@@ -133,6 +134,18 @@ def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
 def test_settings_without_meaning_are_refused(settings: ReconstructionSettings | str) -> None:
     with pytest.raises(InputError, match="expected"):
         GaussianReconstructor(settings=settings)
+
+
+def test_python_refuses_stacks_that_are_not_of_one_head_as_the_command_does() -> None:
+    first, second = stacks_of_two()
+    affine = second.affine.copy()
+    affine[:3, 3] += 1500
+    reconstructor = GaussianReconstructor(settings="preview")
+    for call in (reconstructor.reconstruct, reconstructor.register_stacks):
+        with pytest.raises(InputError, match=r"^first \(stack 3\): holds the same image as first \(stack 1\); "):
+            call([first, second, first])
+        with pytest.raises(InputError, match=r"^second: is 2\d\d\d mm from first by its header; expected scans of one"):
+            call([first, replace(second, affine=affine)])
 
 
 def test_a_usage_error_as_a_process() -> None:

@@ -47,7 +47,8 @@ def stacks(draw: st.DrawFn) -> Stack:
     affine[:3, 3] = draw(st.tuples(*[st.floats(-1e4, 1e4)] * 3))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     scale = 10.0 ** draw(st.integers(-6, 6))
-    data = ((np.abs(rng.normal(size=shape)) + draw(st.floats(0, 3))) * scale).astype(np.float32)
+    # clear of zero: what is nearly zero becomes zero, and a zero in so small a mask is cut from it
+    data = ((np.maximum(np.abs(rng.normal(size=shape)), 0.02) + draw(st.floats(0, 3))) * scale).astype(np.float32)
     data.flat[0] = scale  # at least one positive value
     data.flat[-1] = -scale  # and a negative one beside the brain
     mask = rng.random(shape) < draw(st.floats(0.2, 1.0))

@@ -140,7 +140,10 @@ STACKS: dict[str, tuple[Maker, str]] = {
         "pixdim.* should be non-zero",
     ),
     # content
-    "500 slices": (lambda folder: write(folder / "odd.nii.gz", image(shape=(24, 20, 500)), DENSE), ""),
+    "500 slices": (
+        lambda folder: write(folder / "odd.nii.gz", image(shape=(24, 20, 500)), DENSE),
+        "spacings do not tell (1 x 1 x 1.02 mm), nor does its header; name the axis there",
+    ),
     "slices thinner than pixels": (
         lambda folder: write(folder / "odd.nii.gz", image(), THIN),
         "thickness 0.9 mm is less than the pixels' 2 x 2 mm; check --thickness",
