@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +48,8 @@ class Stack:
         axes: how the file's arrays became these.
         file_affine: [4, 4] of the file, before it was rounded to `affine` (`settled`); None where there is no file.
         mask_source, mask_detail: see `FoundMask`.
-        level: what the intensities of the file were multiplied by (`acquisition.intensity_levels`).
+        level: [K] or [1] what the intensities of each slice, or of all, were multiplied by
+            (`acquisition.intensity_levels`).
         remarks: doubts about its files, for the verdict.
 
     Raises:
@@ -68,7 +69,7 @@ class Stack:
     file_affine: NDArray[np.float64] | None = None
     mask_source: MaskSource = "file"
     mask_detail: str = ""
-    level: float = 1.0
+    level: NDArray[np.float64] = field(default_factory=lambda: np.ones(1))
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -84,6 +85,7 @@ class Stack:
         object.__setattr__(self, "image", np.where(np.isfinite(image), image, np.float32(0)))
         object.__setattr__(self, "mask", mask)
         object.__setattr__(self, "affine", affine)
+        object.__setattr__(self, "level", np.atleast_1d(np.asarray(self.level, np.float64)))
         object.__setattr__(self, "thickness_mm", float(self.thickness_mm))
         object.__setattr__(self, "in_plane_fwhm_pixels", widths)
 

@@ -102,7 +102,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         cloud=cloud,
         intensity_scale=found.intensity,
         slices=by_headers(fit.slices, found.stacks),
-        gain=gain_in_files(fit.gain, fit.slices.stack_id, found.stacks),
+        gain=gain_in_files(fit.gain, fit.slices, found.stacks),
         weight=fit.weight,
         ncc=found.registration.ncc,
         uncertainty=uncertainty,

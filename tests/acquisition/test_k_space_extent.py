@@ -98,6 +98,8 @@ def test_an_interpolated_stack_has_the_psf_of_its_acquired_pixels(
     with caplog.at_level(logging.INFO):
         stack = load(tmp_path, order)
     first, second = stack.origin.filled_share
+    assert first is not None
+    assert second is not None
     assert (first, second) == (pytest.approx(0.5, abs=0.03), pytest.approx(0.75, abs=0.03))
     assert stack.in_plane_fwhm_pixels == (pytest.approx(1.2 / first), pytest.approx(1.2 / second))
     assert f"k-space filled to {first:g} x {second:g}" in caplog.text

@@ -235,10 +235,11 @@ def test_real_sidecars_are_read(real: list[Path], caplog: pytest.LogCaptureFixtu
     assert [stack.origin.phase_resolution for stack in stacks] == [P] * 3
     for stack, phase_axis in zip(stacks, (0, 1, 0), strict=True):
         # the spectrum ends there, too; the scanner's filter takes a tenth
-        share = stack.origin.filled_share
-        assert share[phase_axis] == pytest.approx(0.9 * P, abs=0.02)
-        assert share[1 - phase_axis] is None
-        assert stack.in_plane_fwhm_pixels[phase_axis] == pytest.approx(1.2 / share[phase_axis])
+        share = stack.origin.filled_share[phase_axis]
+        assert share is not None
+        assert share == pytest.approx(0.9 * P, abs=0.02)
+        assert stack.origin.filled_share[1 - phase_axis] is None
+        assert stack.in_plane_fwhm_pixels[phase_axis] == pytest.approx(1.2 / share)
         assert stack.in_plane_fwhm_pixels[1 - phase_axis] == 1.2
     assert not caplog.messages
 
