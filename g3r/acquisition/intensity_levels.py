@@ -56,7 +56,7 @@ def level_notes(stacks: Sequence[Stack]) -> list[str]:
         if len(bright):
             numbers = ", ".join(map(str, bright.tolist()))
             lines.append(
-                f"{stack.name}: slices {numbers} were over {BRIGHT:g} times as bright as the others, now as these"
+                f"{stack.name}: slices {numbers} darkened to the level of the others, more than {BRIGHT:g} times"
             )
     return lines
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, generate_binary_structure
 
+from g3r.acquisition.k_space_extent import filled_share
+from g3r.acquisition.psf import partial_fwhm_pixels
 from g3r.acquisition.stacks import Stack
 
 Stacks = tuple[Stack, ...]
@@ -57,6 +59,34 @@ def images_cut() -> Damage:
         return replace(stack, image=np.where(stack.mask, stack.image, np.float32(0)))
 
     return Damage(lambda stacks, other, rng: tuple(map(cut, stacks)))
+
+
+def images_interpolated(factor: int) -> Damage:
+    """Interpolate all stacks to smaller pixels by zeros around k-space, as scanners do; the spectrum is then looked at.
+
+    Args:
+        factor: pixels per acquired pixel, along either axis.
+    """
+
+    def interpolated(stack: Stack) -> Stack:
+        k_space = np.fft.fftshift(np.fft.fft2(stack.image, axes=(0, 1)), axes=(0, 1))
+        # the zero frequency is number n // 2 before and after
+        before = [factor * n // 2 - n // 2 for n in stack.image.shape[:2]]
+        after = [factor * n - n - first for n, first in zip(stack.image.shape, before, strict=False)]
+        filled = np.pad(k_space, [*zip(before, after, strict=True), (0, 0)])
+        image = np.abs(np.fft.ifft2(np.fft.ifftshift(filled, axes=(0, 1)), axes=(0, 1))) * factor**2
+        affine = stack.affine.copy()
+        affine[:3, :2] /= factor
+        # pixel n of the acquired image is number factor n, and the middle of its part of the mask
+        shift = (-(factor // 2), -(factor // 2))
+        mask = np.roll(stack.mask.repeat(factor, axis=0).repeat(factor, axis=1), shift, axis=(0, 1))
+        image = image.astype(np.float32)
+        first, second = (partial_fwhm_pixels(filled_share(image, axis) or 1.0) for axis in (0, 1))
+        return replace(
+            stack, image=image, mask=mask, affine=affine, file_affine=None, in_plane_fwhm_pixels=(first, second)
+        )
+
+    return Damage(lambda stacks, other, rng: tuple(map(interpolated, stacks)))
 
 
 def slices_lost(share: float) -> Damage:

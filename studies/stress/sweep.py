@@ -92,6 +92,9 @@ def _conditions() -> Iterator[Condition]:
         leave_out = "the mask of" if pixels < 0 else ""
         yield Condition(what="masks", level=f"{pixels:+d} pixels", damage=damage.masks_grown(pixels), fault=leave_out)
     yield Condition(what="images", level="zero beyond their masks", damage=damage.images_cut())
+    coarse = {"resolution_mm": 1.2}
+    yield Condition(what="images", level="1.2 mm", taken=coarse)
+    yield Condition(what="images", level="1.2 to 0.6 mm", taken=coarse, damage=damage.images_interpolated(2))
     yield Condition(what="severe motion and", level="SNR 8", motion="severe", taken={"snr": 8.0})
     yield Condition(what="severe motion and", level="4.4 mm", motion="severe", taken={"thickness_mm": 4.4})
     yield Condition(what="severe motion and", level="two stacks", motion="severe", damage=damage.first_stacks(2))

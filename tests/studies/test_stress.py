@@ -47,6 +47,14 @@ def test_images_are_cut_where_their_masks_end(stacks: tuple[Stack, ...]) -> None
         np.testing.assert_array_equal(new.image[old.mask], old.image[old.mask])
 
 
+def test_interpolated_images_go_through_the_acquired_pixels(stacks: tuple[Stack, ...]) -> None:
+    for old, new in zip(stacks, after(damage.images_interpolated(2), stacks), strict=True):
+        np.testing.assert_allclose(new.image[::2, ::2], np.abs(old.image), rtol=1e-4, atol=1e-4 * old.image.max())
+        np.testing.assert_allclose(new.grid.world([6, 4, 1]), old.grid.world([3, 2, 1]))
+        np.testing.assert_array_equal(new.mask[::2, ::2], old.mask)
+        assert new.mask.sum() == pytest.approx(4 * old.mask.sum(), rel=0.02)
+
+
 def test_headers_and_single_stacks(stacks: tuple[Stack, ...]) -> None:
     assert [one.thickness_mm for one in after(damage.stated_thickness(0.7), stacks)] == pytest.approx([2.8] * 3)
     first, second, last = after(damage.slices_reversed(), stacks)
