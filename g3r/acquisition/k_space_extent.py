@@ -39,7 +39,7 @@ def filled_share(image: NDArray[np.floating], axis: int) -> float | None:
         image: [I, J, K] slices along the third axis, with what surrounds the head.
         axis: 0 or 1.
     """
-    if image.shape[axis] < FEWEST_PIXELS or not image.any():
+    if image.shape[axis] < FEWEST_PIXELS or not np.any(image[np.isfinite(image)]):
         return None
     level = _log_power(image, axis)
     frequency = np.arange(N_FREQUENCIES) / N_FREQUENCIES
@@ -64,11 +64,13 @@ def _step(level: NDArray[np.float64], distance: NDArray[np.float64]) -> float:
 
 
 def _log_power(image: NDArray[np.floating], axis: int) -> NDArray[np.float64]:
-    """Decimal logarithm of power at `N_FREQUENCIES` frequencies along an axis, averaged over lines and slices."""
-    lines = np.moveaxis(image, axis, -1).reshape(-1, image.shape[axis])
-    lines = lines[lines.any(1)]
-    spectrum = np.fft.rfft((lines - lines.mean(1, keepdims=True)) * np.hanning(lines.shape[1]), axis=1)
-    power = (spectrum.real**2 + spectrum.imag**2).mean(0)
+    """Decimal logarithm of power at `N_FREQUENCIES` frequencies along an axis, of all lines and slices."""
+    power = np.zeros(image.shape[axis] // 2 + 1)
+    scale = float(np.abs(image[np.isfinite(image)]).max())
+    for one in np.moveaxis(image, 2, 0):  # slice by slice, so that little memory is needed
+        lines = np.moveaxis(np.where(np.isfinite(one), one, 0) / np.float64(scale), axis, 1)
+        spectrum = np.fft.rfft((lines - lines.mean(1, keepdims=True)) * np.hanning(lines.shape[1]), axis=1)
+        power += (spectrum.real**2 + spectrum.imag**2).sum(0)
     floor = max(float(power.max()) * 1e-12, np.finfo(np.float64).tiny)
     at = np.arange(N_FREQUENCIES) / N_FREQUENCIES * (len(power) - 1)
     level = np.interp(at, np.arange(len(power)), np.log10(np.maximum(power, floor)))

@@ -67,6 +67,14 @@ def test_images_as_acquired_show_no_end(seed: int, noise: float) -> None:
     assert [filled_share(image, axis) for axis in (0, 1)] == [None, None]
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_scale_and_odd_values_do_not_matter(scale: float) -> None:
+    image = zero_filled(acquired(), (2.0, 1.0)) * np.float32(scale)
+    image[:, 0], image[5, 1] = np.nan, np.inf
+    assert filled_share(image, 0) == pytest.approx(0.5, abs=0.03)
+    assert filled_share(np.full(SHAPE, np.nan), 0) is None
+
+
 def test_images_that_say_nothing_show_no_end() -> None:
     assert filled_share(np.zeros(SHAPE, np.float32), 0) is None
     assert filled_share(np.ones(SHAPE, np.float32), 1) is None
