@@ -88,9 +88,13 @@ def read_training(path: Path) -> TrainingCheckpoint:
         if is_out_of_memory(error):
             raise
         raise InputError(f"{path}: cannot be read as a checkpoint ({type(error).__name__}); {EXPECTED}") from error
-    if not isinstance(content, dict) or "state_dict" not in content or TRAINING_ENTRY not in content:
-        raise InputError(f"{path}: was not written by this version of g3r-pretrain; {EXPECTED}")
-    return TrainingCheckpoint(path, content[TRAINING_ENTRY], content["state_dict"])
+    whole = content if isinstance(content, dict) else {}
+    entry, state = whole.get(TRAINING_ENTRY), whole.get("state_dict")
+    if not (isinstance(entry, dict) and "kind" in entry and isinstance(state, dict)):
+        raise InputError(f"{path}: is no checkpoint of g3r-pretrain; {EXPECTED}")
+    if not all(isinstance(value, torch.Tensor) for value in state.values()):
+        raise InputError(f"{path}: its weights are no tensors; {EXPECTED}")
+    return TrainingCheckpoint(path, entry, state)
 
 
 def check_conventions(entry: Mapping[str, Any], expected: Mapping[str, str], source: str) -> None:

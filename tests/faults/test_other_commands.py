@@ -16,6 +16,7 @@ import torch
 from data_synth import cli as simulate
 from g3r.cli import bench, export
 from g3r.cli.infer import main as infer
+from g3r.prior.model import Prior
 from tests.faults.bad_files import BAD_STACKS, USABLE_AS_A_VOLUME
 from tests.faults.commands import assert_refused, run
 from tests.faults.nifti_files import ball, write
@@ -79,7 +80,12 @@ def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tall
         case.refused()
 
 
-SAID: dict[str, Any] = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
+SAID: dict[str, Any] = {
+    "kind": "prior",
+    "training_data": "",
+    "optimiser_steps": 1,
+    "conventions": dict(Prior.conventions),
+}
 RUNS: dict[str, Any] = {
     "missing": None,
     "empty": b"",
@@ -108,7 +114,7 @@ def test_export_refuses_a_bad_checkpoint_in_one_line(name: str, tmp_path: Path, 
         torch.save(content, path)
     with tally.case() as case:
         outcome = run(export.main, [path, tmp_path / "prior.safetensors"], tmp_path)
-        assert_refused(outcome, "g3r-export", "last.ckpt", "expected a training checkpoint|export another")
+        assert_refused(outcome, "g3r-export", "last.ckpt", "expected a training checkpoint|use another checkpoint")
         case.refused()
 
 

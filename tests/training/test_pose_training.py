@@ -131,7 +131,7 @@ def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys:
 @pytest.mark.parametrize(
     ("alter", "expected"),
     [
-        (lambda content: content.pop("g3r_export"), "not written by this version of g3r-pretrain"),
+        (lambda content: content.pop("g3r_export"), "is no checkpoint of g3r-pretrain"),
         (lambda content: content["g3r_export"].update(weeks=[25.0]), "cannot be used"),
         (lambda content: content["g3r_export"].update(kind="mask"), "cannot be used"),
         (lambda content: content["state_dict"].popitem(), "cannot be used"),

@@ -135,8 +135,8 @@ def spoil(content: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("alter", "expected"),
     [
-        (without("g3r_export"), "not written by this version of g3r-pretrain"),
-        (without("state_dict"), "not written by this version of g3r-pretrain"),
+        (without("g3r_export"), "is no checkpoint of g3r-pretrain"),
+        (without("state_dict"), "is no checkpoint of g3r-pretrain"),
         (lambda content: content["g3r_export"].update(voxel_mm=None), "cannot be used"),
         (lambda content: content["g3r_export"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
         (lambda content: content["g3r_export"].update(weeks=[25.0]), "1 ages for a template of 2"),
