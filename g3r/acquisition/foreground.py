@@ -1,8 +1,8 @@
 """The brain mask of the volume, from the masks of slices where slices looked, and by shape where none did.
 
-A voxel is in one of three states: seen and called brain, seen and called something else, or unseen. The masks say
-nothing about unseen voxels: shape decides there (the prior network's brain probability, or the hull of the seen brain),
-never the absence of a mask.
+A voxel is in one of three states: seen and called brain, seen and called something else, or out of the reach of all
+slices. The masks say nothing about the last: shape decides there (the prior network's brain probability, or the hull
+of the seen brain), never the absence of a mask.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ FLAT = 1e-6
 """Tolerance in voxels: a voxel that is nearer to a face of the hull lies on it."""
 
 LIKELY, POSSIBLE = 0.5, 0.25
-"""Brain probability above which an unseen voxel is in the mask, and above which it is shown. The second is lower: a rim
-voxel that is left out costs as much as many that are a little wrong."""
+"""Brain probability above which a voxel out of reach is in the mask, and above which it is shown. The second is lower:
+a rim voxel that is left out costs as much as many that are a little wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +36,9 @@ class Foreground:
         core: [I, J, K] seen, and brain by more than half of the slices.
         share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is hardly seen. With a
             single stack the share is not known; it is 1 in all voxels that are seen.
-        unseen: [I, J, K] not seen.
-        thin: [I, J, K] hardly seen or unseen, gaps between slices included.
+        out_of_reach: [I, J, K] not seen, and farther from slices than a gap between them: smoothed over half the slice
+            spacing, coverage is below a third of one stack's. `unseen.nii.gz` shows gaps, too (`Mixture.seen`).
+        thin: [I, J, K] hardly seen or out of reach, gaps between slices included.
         rim_voxels: how far the volume is shown beyond the support, at most.
         possible_voxels: how far beyond the mask the support may reach where no slice looked.
     """
@@ -45,7 +46,7 @@ class Foreground:
     brain: NDArray[np.bool_]
     core: NDArray[np.bool_]
     share: NDArray[np.float32]
-    unseen: NDArray[np.bool_]
+    out_of_reach: NDArray[np.bool_]
     thin: NDArray[np.bool_]
     rim_voxels: int = 1
     possible_voxels: int = 2
@@ -61,7 +62,7 @@ class Foreground:
             brain_probability: see `mask`; decides where slices hardly looked. Without it the support is shown there.
         """
         low, high = EDGE
-        share, full, hardly_seen = self.share, mask, self.unseen | self.thin
+        share, full, hardly_seen = self.share, mask, self.out_of_reach | self.thin
         if brain_probability is None:
             full = mask | (hardly_seen & support)
         else:
@@ -81,13 +82,13 @@ class Foreground:
         brain = self._completed(self.brain, brain_probability, POSSIBLE)
         if brain_probability is None:
             return brain
-        if self.unseen.any():
+        if self.out_of_reach.any():
             near = binary_dilation(self.mask(brain_probability), iterations=self.possible_voxels)
-            brain &= near | ~self.unseen
+            brain &= near | ~self.out_of_reach
         return brain | (self.thin & binary_dilation(brain, iterations=THIN_MARGIN_VOXELS))
 
     def mask(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
-        """The brain mask [I, J, K]: the seen brain, and the unseen voxels that are brain by shape.
+        """The brain mask [I, J, K]: the seen brain, and the voxels out of reach that are brain by shape.
 
         Only the largest connected piece is kept, and its holes are filled.
 
@@ -99,13 +100,13 @@ class Foreground:
     def _completed(
         self, seen_brain: NDArray[np.bool_], brain_probability: NDArray[np.floating] | None, least: float
     ) -> NDArray[np.bool_]:
-        if not self.unseen.any():
-            likely = self.unseen
+        if not self.out_of_reach.any():
+            likely = self.out_of_reach
         elif brain_probability is None:
-            likely = _hull(seen_brain, self.unseen)
+            likely = _hull(seen_brain, self.out_of_reach)
         else:
             likely = brain_probability > least
-        brain = seen_brain | (self.unseen & likely)
+        brain = seen_brain | (self.out_of_reach & likely)
         pieces, n_pieces = label(brain)
         if n_pieces > 1:
             brain = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))

@@ -40,12 +40,12 @@ N_ITERATIONS = 4
 """Conjugate-gradient steps for the brain share, from a start that is nearly right."""
 
 SEEN_SHARE = 1 / 3
-"""Coverage below which a voxel is unseen, as a share of the average coverage of one stack. With the smoothing over half
-the slice spacing, seen voxels end 0.75 of the spacing beyond a stack's last slice."""
+"""Coverage below which a voxel is out of reach, as a share of the average coverage of one stack. With the smoothing
+over half the slice spacing, seen voxels end 0.75 of the spacing beyond a stack's last slice."""
 
 POSSIBLE_MM = 1.6
-"""How far beyond the mask unseen voxels may be shown. Beyond all slices, at the border of the grid, the network is
-unreliable: it may show a slab there, with a brain probability of 0.25 to 0.5, around the end of the brain stem."""
+"""How far beyond the mask voxels out of reach may be shown. Beyond all slices, at the border of the grid, the network
+is unreliable: it may show a slab there, with a brain probability of 0.25 to 0.5, around the end of the brain stem."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class Votes:
         slices: K slices in place.
         grid: of the maps.
         weight: [K] slice weights, smaller for slices of parallel stacks (`votes_per_stack`).
-        brain, core, unseen, thin: see `Foreground`.
+        brain, core, out_of_reach, thin: see `Foreground`.
         density: [I, J, K] of slices over each voxel (`coverage`).
         rough: [I, J, K] share of the slices over a voxel whose masks contain it.
         slice_spacing_voxels: the largest slice spacing of the stacks.
@@ -67,7 +67,7 @@ class Votes:
     weight: NDArray[np.float64]
     brain: NDArray[np.bool_]
     core: NDArray[np.bool_]
-    unseen: NDArray[np.bool_]
+    out_of_reach: NDArray[np.bool_]
     thin: NDArray[np.bool_]
     density: NDArray[np.float32]
     rough: NDArray[np.float32]
@@ -103,7 +103,7 @@ class Votes:
             weight=voice,
             brain=brain,
             core=core,
-            unseen=~seen,
+            out_of_reach=~seen,
             thin=thin,
             density=density,
             rough=rough,
@@ -113,11 +113,11 @@ class Votes:
     def foreground(self) -> Foreground:
         """The foreground, with the brain share, which takes longer than all else."""
         voxel_mm = float(self.grid.spacing_mm.mean())
-        share, rim_voxels = (~self.unseen).astype(np.float32), 1
+        share, rim_voxels = (~self.out_of_reach).astype(np.float32), 1
         if self.slices.n_stacks > 1:
             smooth_voxels = SMOOTH_SHARE * self.slice_spacing_voxels
             share = _sharpened(self.rough, self.slices, self.grid, self.weight, smooth_voxels)
-            share = np.where(self.unseen | self.thin, 0, share).clip(0, 1)
+            share = np.where(self.out_of_reach | self.thin, 0, share).clip(0, 1)
         else:
             rim_voxels = max(1, round(SINGLE_RIM_MM / voxel_mm))
         possible_voxels = max(1, round(POSSIBLE_MM / voxel_mm))
@@ -125,7 +125,7 @@ class Votes:
             brain=self.brain,
             core=self.core,
             share=share,
-            unseen=self.unseen,
+            out_of_reach=self.out_of_reach,
             thin=self.thin,
             rim_voxels=rim_voxels,
             possible_voxels=possible_voxels,

@@ -59,15 +59,15 @@ def filled_volumes(
     box_mm = placed.box_mm() if placed else None
     volumes = InitialVolumes.of(poses.slices, poses.gain, poses.weight, voxel_mm, box_mm)
     whole = prior_volume(volumes, poses.gain, poses.weight, None, placed, n_views=1, tiling=Tiling())
-    unknown = volumes.foreground.unseen.copy()
+    unknown = volumes.foreground.out_of_reach.copy()
     for axis in range(3):
         edges = [slice(None)] * 3
         edges[axis] = slice(0, None, unknown.shape[axis] - 1)
         unknown[tuple(edges)] = False
-    unseen = volumes.foreground.unseen
+    out_of_reach = volumes.foreground.out_of_reach
     found = {
-        "nothing": np.where(unseen, 0, volumes.sharp),
-        "harmonic": harmonic(np.where(unseen, 0, volumes.sharp), unknown),
-        "template": np.where(unseen, whole.values, volumes.sharp),
+        "nothing": np.where(out_of_reach, 0, volumes.sharp),
+        "harmonic": harmonic(np.where(out_of_reach, 0, volumes.sharp), unknown),
+        "template": np.where(out_of_reach, whole.values, volumes.sharp),
     }
     return {name: one.astype(np.float32) for name, one in found.items()}, volumes

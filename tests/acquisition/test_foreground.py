@@ -26,10 +26,10 @@ from tests.acquisition.ellipsoids import (
 )
 
 
-def beside_nothing(brain: NDArray[np.bool_], unseen: NDArray[np.bool_]) -> Foreground:
+def beside_nothing(brain: NDArray[np.bool_], out_of_reach: NDArray[np.bool_]) -> Foreground:
     """Voxels that are wholly brain or not, and none that is hardly seen."""
     share, thin = brain.astype(np.float32), np.zeros_like(brain)
-    return Foreground(brain=brain, core=brain, share=share, unseen=unseen, thin=thin)
+    return Foreground(brain=brain, core=brain, share=share, out_of_reach=out_of_reach, thin=thin)
 
 
 @pytest.mark.parametrize("n_stacks", [1, 2, 3])
@@ -37,7 +37,7 @@ def beside_nothing(brain: NDArray[np.bool_], unseen: NDArray[np.bool_]) -> Foreg
 def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: float) -> None:
     stacks = [ellipsoid_stack(t, thickness_mm=thickness_mm, gap_mm=gap_mm) for t in TURNS[:n_stacks]]
     found = foreground(slices_from_stacks(stacks), GRID)
-    assert not found.unseen[depth(WORLD) > -0.2].any()
+    assert not found.out_of_reach[depth(WORLD) > -0.2].any()
     mask = found.support()
     # generous (INSIDE_SHARE below one half), with one stack as with three
     excess_mm = np.cbrt(RADII_MM.prod()) * (np.cbrt(volume_of(mask) / TRUE_MM3) - 1)
@@ -62,10 +62,10 @@ def test_a_cut_off_end_is_unseen_and_not_background() -> None:
     found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)]), GRID)
     z = WORLD[..., 2]
     # the mask ends three quarters of the slice spacing beyond the centre of the last slice
-    assert found.unseen[z < -3.8].all()
-    assert not found.unseen[(z > -2.2) & (np.abs(WORLD).max(-1) < 38)].any()
+    assert found.out_of_reach[z < -3.8].all()
+    assert not found.out_of_reach[(z > -2.2) & (np.abs(WORLD).max(-1) < 38)].any()
     assert found.brain[(z > 2) & (depth(WORLD) > 0.15)].all()
-    assert not (found.brain & found.unseen).any()
+    assert not (found.brain & found.out_of_reach).any()
     # without a network the mask ends with the slices
     assert not found.support()[z < -3.8].any()
     # with a network it is the whole head
@@ -78,7 +78,7 @@ def test_a_cut_off_end_is_unseen_and_not_background() -> None:
 def test_without_a_network_the_hull_of_what_was_seen_fills_a_missing_slab() -> None:
     found = foreground(slices_from_stacks([without(ellipsoid_stack(), -6.5, 6.5)]), GRID)
     slab = np.abs(WORLD[..., 2]) < 4
-    assert found.unseen[slab].all()
+    assert found.out_of_reach[slab].all()
     mask = found.support()
     assert mask[slab & (depth(WORLD) > 0.06)].all()
     assert not mask[depth(WORLD) < -0.2].any()
@@ -93,32 +93,32 @@ def test_without_a_network_the_hull_of_what_was_seen_fills_a_missing_slab() -> N
 def test_the_hull_reaches_the_borders_of_the_grid() -> None:
     brain = np.zeros((12, 5, 6), bool)
     brain[1:3], brain[8:11] = True, True
-    unseen = np.zeros_like(brain)
-    unseen[4:7], unseen[11] = True, True
+    out_of_reach = np.zeros_like(brain)
+    out_of_reach[4:7], out_of_reach[11] = True, True
     seen = brain | (np.arange(12) == 3)[:, None, None] | (np.arange(12) == 7)[:, None, None]
-    mask = beside_nothing(seen, unseen).support()
+    mask = beside_nothing(seen, out_of_reach).support()
     assert mask[1:11].all()
     assert not mask[[0, 11]].any()
 
 
 def test_a_flat_or_lone_brain_has_no_hull() -> None:
-    brain, unseen = np.zeros((6, 6, 6), bool), np.ones((6, 6, 6), bool)
-    brain[3, 1:5, 1:5], unseen[3] = True, False
-    found = beside_nothing(brain, unseen)
+    brain, out_of_reach = np.zeros((6, 6, 6), bool), np.ones((6, 6, 6), bool)
+    brain[3, 1:5, 1:5], out_of_reach[3] = True, False
+    found = beside_nothing(brain, out_of_reach)
     np.testing.assert_array_equal(found.support(), brain)
 
 
 def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
     found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0)]), GRID)
     right = (WORLD[..., 0] > 0) & (WORLD[..., 2] < 0)  # one piece with what was seen
-    contrary = np.where(found.unseen, right, ~found.brain).astype(np.float32)
-    np.testing.assert_array_equal(found.mask(contrary), found.core | (found.unseen & right))
+    contrary = np.where(found.out_of_reach, right, ~found.brain).astype(np.float32)
+    np.testing.assert_array_equal(found.mask(contrary), found.core | (found.out_of_reach & right))
     shown = found.support(contrary)
-    np.testing.assert_array_equal(shown & ~found.thin, (found.brain | (found.unseen & right)) & ~found.thin)
+    np.testing.assert_array_equal(shown & ~found.thin, (found.brain | (found.out_of_reach & right)) & ~found.thin)
     # where coverage is low, the shown image may extend for two voxels
-    margin = shown & ~(found.brain | (found.unseen & right))
+    margin = shown & ~(found.brain | (found.out_of_reach & right))
     assert margin.any()
-    assert not (margin & ~binary_dilation(found.brain | (found.unseen & right), iterations=2)).any()
+    assert not (margin & ~binary_dilation(found.brain | (found.out_of_reach & right), iterations=2)).any()
     # improbable voxels are not shown, and undecided ones are not in the mask
     np.testing.assert_array_equal(found.support(np.full(GRID.shape, 0.25)), found.support(0 * contrary))
     np.testing.assert_array_equal(found.mask(np.full(GRID.shape, 0.5)), found.mask(0 * contrary))
@@ -160,7 +160,7 @@ def test_a_factor_common_to_all_weights_says_nothing() -> None:
     for factor in (0.5, 1e-3):
         other = foreground(slices, GRID, np.full(len(slices), factor))
         assert (one.brain != other.brain).mean() < 1e-4
-        assert (one.unseen != other.unseen).mean() < 1e-4
+        assert (one.out_of_reach != other.out_of_reach).mean() < 1e-4
 
 
 def test_slices_without_weight_have_seen_nothing() -> None:
@@ -169,7 +169,7 @@ def test_slices_without_weight_have_seen_nothing() -> None:
     assert (weight == 0).sum() >= 4
     blank = foreground(slices_from_stacks([without(ellipsoid_stack(), -6.5, 6.5)]), GRID)
     found = foreground(slices, GRID, weight)
-    np.testing.assert_array_equal(found.unseen, blank.unseen)
+    np.testing.assert_array_equal(found.out_of_reach, blank.out_of_reach)
     np.testing.assert_array_equal(found.brain, blank.brain)
 
 
@@ -196,7 +196,7 @@ def test_what_one_stack_alone_has_seen_stays_inside() -> None:
     whole = ellipsoid_stack(TURNS[0])
     partly = [ellipsoid_stack(t, low_mm=0.0) for t in TURNS[1:]]
     found = foreground(slices_from_stacks([whole, *partly]), GRID)
-    assert not found.unseen[depth(WORLD) > -0.2].any()
+    assert not found.out_of_reach[depth(WORLD) > -0.2].any()
     mask = found.support()
     uncovered = (WORLD @ TURNS[1][:, 2] < -8) & (WORLD @ TURNS[2][:, 2] < -8) & (depth(WORLD) > 0.1)
     assert uncovered.sum() > 500

@@ -35,7 +35,7 @@ def test_the_edge_fades_from_the_brain_outwards() -> None:
 def test_a_single_stack_is_shown_in_full_up_to_a_rim() -> None:
     found = foreground(slices_from_stacks([ellipsoid_stack()]), GRID.respaced(0.8))
     shown = binary_dilation(support := found.support(), iterations=2)  # 1.6 mm
-    np.testing.assert_array_equal(found.edge(support, found.mask()), support | (shown & ~found.unseen))
+    np.testing.assert_array_equal(found.edge(support, found.mask()), support | (shown & ~found.out_of_reach))
 
 
 @pytest.mark.parametrize("n_stacks", [1, 2])
@@ -43,7 +43,7 @@ def test_what_no_slice_saw_is_shown_in_full_where_there_is_brain(n_stacks: int) 
     found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)] * n_stacks), GRID)
     likely = (depth(WORLD) > 0).astype(np.float32)
     edge = found.edge(support := found.support(likely), found.mask(likely))
-    np.testing.assert_array_equal(edge[found.unseen], support[found.unseen])
+    np.testing.assert_array_equal(edge[found.out_of_reach], support[found.out_of_reach])
 
 
 @pytest.mark.parametrize(("probability", "shown"), [(0.0, 0.0), (0.02, 0.0), (0.09, 0.5), (0.2, 1.0)])
@@ -51,6 +51,6 @@ def test_what_no_slice_saw_fades_with_the_probability_of_brain(probability: floa
     found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)]), GRID)
     likely = (depth(WORLD) > 0).astype(np.float32)
     support, mask = found.support(likely), found.mask(likely)
-    rim = found.unseen & ~support & binary_dilation(support)
+    rim = found.out_of_reach & ~support & binary_dilation(support)
     assert rim.any()
     np.testing.assert_allclose(found.edge(support, mask, np.full(GRID.shape, probability))[rim], shown, atol=1e-3)

@@ -48,7 +48,7 @@ def test_what_several_stacks_saw_is_seen_by_one_of_them() -> None:
     """Parallel stacks count less in what is brain, not in what was seen: what one of five stacks saw is seen."""
     stacks = [ellipsoid_stack(thickness_mm=3.0 + 0.1 * n, low_mm=0.0) for n in range(4)]
     found = foreground(slices_from_stacks([*stacks, ellipsoid_stack()]), GRID)
-    assert not found.unseen[depth(WORLD) > -0.1].any()
+    assert not found.out_of_reach[depth(WORLD) > -0.1].any()
     assert found.core[depth(WORLD) > 0.05].all()
 
 

@@ -60,7 +60,7 @@ def test_density_is_of_whole_slices_and_the_fit_s_of_masked_pixels(missing: Init
     assert missing.share[seen & (radius < 0.8 * RADIUS_MM)].min() > 0.85
     assert missing.share[seen & (radius > 1.2 * RADIUS_MM)].max() < 0.02
     assert np.percentile(missing.coarse[missing.masked_density > 0.1], 99) == pytest.approx(1, abs=1e-3)
-    assert missing.foreground.unseen.any()
+    assert missing.foreground.out_of_reach.any()
 
 
 def test_the_grid_has_room_for_a_head_that_was_cut_off() -> None:
@@ -93,9 +93,9 @@ def test_without_a_network_the_prior_volume_is_v_sharp_smoothly_continued(missin
     other = prior_volume(missing, gain, gain, None, None, n_views=1, tiling=Tiling(), least_squares=True)
     found = least_squares_volume(missing, other.support, gain, gain)
     np.testing.assert_allclose(other.values[dense], found[dense], atol=1e-6)
-    unseen = made.mask & missing.foreground.unseen
+    unseen = made.mask & missing.foreground.out_of_reach
     assert unseen.sum() > 200
-    brain = made.mask & ~missing.foreground.unseen
+    brain = made.mask & ~missing.foreground.out_of_reach
     assert made.values[unseen].mean() == pytest.approx(made.values[brain].mean(), rel=0.15)
     # the hull closes the gap
     radius = np.linalg.norm(world_of(missing), axis=-1)
