@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,25 @@ MIN_SLICE_PIXELS = 12
 run.json. Slices without a positive masked pixel are skipped, too: they were not acquired, or were blanked."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _SliceRow:
+    """What `Slices` hold of one slice; see `Slices`, `Planes` and `FieldsOfView`."""
+
+    rotation: NDArray[np.float64]
+    center_mm: NDArray[np.float64]
+    spacing_mm: NDArray[np.float64]
+    shape: tuple[int, ...]
+    psf_var_mm2: NDArray[np.float64]
+    value: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    stack_id: int
+    slice_index: int
+    thickness_mm: float
+    extent_mm: NDArray[np.float64]
+    step_mm: float
+    n_beyond: tuple[int, int]
+
+
 def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
     """Cut stacks into slices, each cropped to the bounding box of its mask.
 
@@ -36,55 +56,61 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
     """
     if not stacks:
         raise InputError("no stack given; pass at least one")
-    rotation, center, spacing, shape, psf = [], [], [], [], []
-    values, masks, stack_id, slice_index, thickness = [], [], [], [], []
-    extent, slice_spacing, beyond = [], [], []
-    for number, stack in enumerate(stacks):
-        # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
-        frame = orthonormal(stack.grid.plane_frame[None])[0]
-        step_mm = stack.spacing_mm[2] * np.sign(frame[:, 2] @ stack.grid.axes[:, 2])
-        acquired = np.array(field_of_view(stack.image))
-        used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
-        n_beyond = _slices_beyond(stack, used)
-        for k in used:
-            inside = stack.mask[:, :, k]
-            box = bounding_box(inside)
-            middle = [(axis.start + axis.stop - 1) / 2 for axis in box] + [k]
-            rotation.append(frame)
-            center.append(stack.grid.world(middle))
-            spacing.append(stack.spacing_mm[:2])
-            shape.append(inside[box].shape)
-            psf.append(psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm, stack.in_plane_fwhm_pixels))
-            values.append(stack.image[:, :, k][box].ravel())
-            masks.append(inside[box].ravel())
-            stack_id.append(number)
-            slice_index.append(k)
-            thickness.append(stack.thickness_mm)
-            whole = acquired + HALF_A_PIXEL - np.array(middle[:2])[:, None]
-            extent.append(whole * stack.spacing_mm[:2, None])
-            slice_spacing.append(step_mm)
-            beyond.append([n_beyond[0] if k == used[0] else 0, n_beyond[1] if k == used[-1] else 0])
-    if not rotation:
+    rows = [row for number, stack in enumerate(stacks) for row in _rows_of(stack, number)]
+    if not rows:
         raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
-    planes = Planes(
-        rotation=np.array(rotation),
-        center_mm=np.array(center),
-        spacing_mm=np.array(spacing),
-        shape=np.array(shape),
-        psf_var_mm2=np.array(psf),
-    )
+
+    def column(name: str) -> NDArray[Any]:
+        return np.array([getattr(row, name) for row in rows])
+
+    geometry = ("rotation", "center_mm", "spacing_mm", "shape", "psf_var_mm2")
+    planes = Planes(**{name: column(name) for name in geometry})
     return Slices(
         planes=planes,
-        value=np.concatenate(values).astype(np.float32),
-        mask=np.concatenate(masks),
-        stack_id=np.array(stack_id, dtype=np.int64),
-        slice_index=np.array(slice_index, dtype=np.int64),
-        thickness_mm=np.array(thickness),
+        value=np.concatenate([row.value for row in rows]).astype(np.float32),
+        mask=np.concatenate([row.mask for row in rows]),
+        stack_id=column("stack_id"),
+        slice_index=column("slice_index"),
+        thickness_mm=column("thickness_mm"),
         header_pose=planes.pose,
         view=FieldsOfView(
-            extent_mm=np.array(extent), spacing_mm=np.array(slice_spacing), n_beyond=np.array(beyond, dtype=np.int64)
+            extent_mm=column("extent_mm"), spacing_mm=column("step_mm"), n_beyond=column("n_beyond").astype(np.int64)
         ),
     )
+
+
+def _rows_of(stack: Stack, number: int) -> Iterator[_SliceRow]:
+    """The usable slices of a stack.
+
+    Args:
+        stack: with images and masks.
+        number: of the stack.
+    """
+    # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
+    frame = orthonormal(stack.grid.plane_frame[None])[0]
+    acquired = np.array(field_of_view(stack.image))
+    used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack)).tolist()
+    before, after = _slices_beyond(stack, used)
+    for k in used:
+        inside = stack.mask[:, :, k]
+        box = bounding_box(inside)
+        middle = [(axis.start + axis.stop - 1) / 2 for axis in box]
+        whole = acquired + HALF_A_PIXEL - np.array(middle)[:, None]
+        yield _SliceRow(
+            rotation=frame,
+            center_mm=stack.grid.world([*middle, k]),
+            spacing_mm=stack.spacing_mm[:2],
+            shape=inside[box].shape,
+            psf_var_mm2=psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm, stack.in_plane_fwhm_pixels),
+            value=stack.image[:, :, k][box].ravel(),
+            mask=inside[box].ravel(),
+            stack_id=number,
+            slice_index=k,
+            thickness_mm=stack.thickness_mm,
+            extent_mm=whole * stack.spacing_mm[:2, None],
+            step_mm=float(stack.spacing_mm[2] * np.sign(frame[:, 2] @ stack.grid.axes[:, 2])),
+            n_beyond=(before if k == used[0] else 0, after if k == used[-1] else 0),
+        )
 
 
 def _blank(stack: Stack) -> NDArray[np.bool_]:
@@ -92,9 +118,9 @@ def _blank(stack: Stack) -> NDArray[np.bool_]:
     return np.asarray(~((stack.image > 0) & stack.mask).any((0, 1)))
 
 
-def _slices_beyond(stack: Stack, used: NDArray[np.int64]) -> tuple[int, int]:
+def _slices_beyond(stack: Stack, used: Sequence[int]) -> tuple[int, int]:
     """Number of consecutive slices with signal before the first and after the last used one."""
-    if not len(used):
+    if not used:
         return 0, 0
     # a slice of one value was not acquired, or was blanked
     dark = stack.image.min((0, 1)) == stack.image.max((0, 1))

@@ -53,15 +53,14 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     Raises:
         NumericalError: the volume is not finite.
     """
-    settings, volumes = plan.settings, found.prior.volumes
+    settings = plan.settings
     qualities = stack_qualities(found.registration, len(found.stacks))
     run.notes += left_out_notes(qualities, found.stacks)
     run.warnings += pose_warnings(qualities, found.stacks)
     run.warnings += parallel_warnings(found.registration.slices)
     fit = found.fit or found.no_fit()
-    cloud = mean_cloud(fit)
     with run.timed(Stage.VOLUME) as tell:
-        written = written_volume(cloud, fit, found, settings, run)
+        written = written_volume(mean_cloud(fit), fit, found, settings, run)
         unseen = _unseen_part(written, found, settings)
         tell(FinishedVolume(volume=written.volume, mask=written.mask, grid=written.grid, unseen=unseen))
     run.warnings += [line for line in (written.check.line() if written.check else "", unseen.line()) if line]
@@ -82,9 +81,31 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         voxel_correction=written.correction.record if written.correction else None,
         edge_by_image=written.edge_by_image,
     )
-    intensity = np.float32(found.intensity)
+    return _result(found, fit, written, maps, record, fill_unseen=settings.fill_unseen)
+
+
+def _result(
+    found: StageResults,
+    fit: SliceFit,
+    written: WrittenVolume,
+    maps: VolumeMaps,
+    record: RunRecord,
+    *,
+    fill_unseen: bool,
+) -> ReconstructionResult:
+    """The result in the intensities of the stacks.
+
+    Args:
+        found: results of the stages.
+        fit: to the slices, or in place of one.
+        written: the volume as shown.
+        maps: what was estimated of it.
+        record: of the run.
+        fill_unseen: False leaves zeros where no slice looked.
+    """
+    volumes, intensity = found.prior.volumes, np.float32(found.intensity)
     volume, mask, uncertainty = written.volume, written.mask, maps.uncertainty
-    if not settings.fill_unseen:
+    if not fill_unseen:
         volume, mask = volume * written.seen, mask & ~written.unseen
         uncertainty = None if uncertainty is None else uncertainty * ~written.unseen
     return ReconstructionResult(
@@ -99,7 +120,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         density=volumes.density,
         prior_grid=volumes.grid,
         correction=written.mixture.correction,
-        cloud=cloud,
+        cloud=mean_cloud(fit),
         intensity_scale=found.intensity,
         slices=by_headers(fit.slices, found.stacks),
         gain=gain_in_files(fit.gain, fit.slices, found.stacks),
