@@ -26,7 +26,7 @@ def mean_normals(slices: Slices) -> NDArray[np.float64]:
 
 
 def votes_per_stack(slices: Slices) -> NDArray[np.float64]:
-    """What the vote of each slice [K] counts, fewer for those whose stack shares its orientation with others.
+    """What the vote of each slice [K] counts: less where its stack shares its orientation with others.
 
     Masks of parallel stacks have some errors in common, above all that they miss the last slices. n votes with a
     correlation of `SHARED` count as n / (1 + (n - 1) `SHARED`) independent ones, so never as more than two of another

@@ -131,9 +131,9 @@ def load_stack(
     """Read a stack and its mask, and its JSON sidecar where there is one.
 
     The slice axis is found by `find_slice_axis`. Image, mask and affine are turned together so that it becomes the
-    last axis and rows have one order (`FileAxes`). Slices keep their
-    numbers. Zeros around an extracted brain are no part of a mask (`mask_of_content`). The affine is rounded; no point
-    within 120 mm of the middle moves by more than 0.02 mm (`settled`).
+    last axis and rows have one order (`FileAxes`). Slices keep their numbers. Zeros around an extracted brain are no
+    part of a mask (`mask_of_content`). The affine is rounded; no point within 120 mm of the middle moves by more than
+    0.02 mm (`settled`).
 
     Args:
         path: of the NIfTI image.
