@@ -1,13 +1,16 @@
 """Size and centre of a head are estimated correctly although slices are missing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation, generate_binary_structure
 
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.area_profile import area_profiles, head_volume_mm3
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
-from tests.acquisition.ellipsoids import ellipsoid_stack
+from tests.acquisition.ellipsoids import TRUE_MM3, ellipsoid_stack
 from tests.registration.moving_heads import as_slices, simulated
 
 
@@ -35,6 +38,27 @@ def test_a_whole_head_counts_as_masked(whole: Slices) -> None:
         assert not profile.has_missing
         assert profile.missing_share == 0
         assert profile.longest_gap_mm == 0
+
+
+@pytest.mark.parametrize("beside", [0.0, 0.15])
+def test_a_mask_far_too_wide_for_a_brain_in_black_counts_by_what_is_not_black(beside: float) -> None:
+    """The template of the head is scaled by this volume, and the search in it fails if it is a third too large."""
+    stack = ellipsoid_stack()
+    disc = generate_binary_structure(2, 1)[:, :, None]
+    noise = np.abs(np.random.default_rng(0).normal(0, beside, stack.image.shape)).astype(np.float32)
+    image = np.where(stack.mask, 1 + noise, noise)
+    wide = replace(stack, image=image, mask=binary_dilation(stack.mask, disc, iterations=6))
+    assert wide.mask.sum() > 1.3 * stack.mask.sum()
+    (found,) = area_profiles(slices_from_stacks([wide]))
+    assert found.volume_mm3 == pytest.approx(TRUE_MM3, rel=0.1)
+
+
+def test_a_mask_as_people_draw_it_counts_whole() -> None:
+    stack = ellipsoid_stack()
+    disc = generate_binary_structure(2, 1)[:, :, None]
+    wide = replace(stack, image=stack.mask.astype(np.float32), mask=binary_dilation(stack.mask, disc, iterations=2))
+    (given,), (found,) = area_profiles(slices_from_stacks([stack])), area_profiles(slices_from_stacks([wide]))
+    assert found.volume_mm3 / given.volume_mm3 == pytest.approx(wide.mask.sum() / stack.mask.sum(), rel=0.03)
 
 
 @pytest.mark.parametrize("span", [(0.45, 0.55), (0.35, 0.65)])
