@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
 
-INTERLEAVES = (1, 2, 3)
-"""Interleaves to try; the first of equally good ones is taken."""
+INTERLEAVES = tuple(range(1, 8))
+"""Interleaves to try; the first of equally good ones is taken. Scanners take every second slice, or one of as many as
+there are packages; some step by the root of the number of slices, which is 7 for 48."""
 
 HEAD_RADIUS_MM = 30.0
 """Half the diameter of a typical head, by which rotations are compared with translations."""

@@ -88,7 +88,7 @@ def _conditions() -> Iterator[Condition]:
     yield Condition(what="slices missing", level="the middle third", damage=damage.span_lost(1 / 3))
     for factor in (0.7, 1.3):
         yield Condition(what="stated thickness", level=f"{factor - 1:+.0%}", damage=damage.stated_thickness(factor))
-    for pixels in (-4, -2, -1, 1, 2, 4):
+    for pixels in (-4, -2, -1, 1, 2, 4, 8):
         leave_out = "the mask of" if pixels < 0 else ""
         yield Condition(what="masks", level=f"{pixels:+d} pixels", damage=damage.masks_grown(pixels), fault=leave_out)
     yield Condition(what="images", level="zero beyond their masks", damage=damage.images_cut())
@@ -97,6 +97,8 @@ def _conditions() -> Iterator[Condition]:
     yield Condition(what="images", level="1.2 to 0.6 mm", taken=coarse, damage=damage.images_interpolated(2))
     yield Condition(what="severe motion and", level="SNR 8", motion="severe", taken={"snr": 8.0})
     yield Condition(what="severe motion and", level="4.4 mm", motion="severe", taken={"thickness_mm": 4.4})
+    fifth = {"interleave": 5}
+    yield Condition(what="severe motion and", level="every fifth slice in turn", motion="severe", taken=fifth)
     yield Condition(what="severe motion and", level="two stacks", motion="severe", damage=damage.first_stacks(2))
     yield Condition(what=ONE_STACK, level="of another contrast", damage=damage.other_contrast(), fault=LAST)
     yield Condition(what=ONE_STACK, level="slices in reverse order", damage=damage.slices_reversed(), fault=LAST)

@@ -73,11 +73,13 @@ def test_the_distance_does_not_depend_on_where_the_head_is() -> None:
 
 def test_time_orders_know_that_slices_are_missing() -> None:
     orders = time_orders(np.array([2, 3, 4, 6, 9]))
-    assert {k: v.tolist() for k, v in orders.items()} == {1: [0, 1, 2, 3, 4], 2: [0, 2, 3, 1, 4], 3: [1, 3, 4, 2, 0]}
+    assert list(orders) == [1, 2, 3, 4, 5, 6, 7]
+    first = {interleave: order.tolist() for interleave, order in orders.items() if interleave <= 3}
+    assert first == {1: [0, 1, 2, 3, 4], 2: [0, 2, 3, 1, 4], 3: [1, 3, 4, 2, 0]}
 
 
 def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom) -> None:
-    for interleave in (1, 2, 3):
+    for interleave in (1, 2, 3, 5):
         level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
         slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
         (sample,) = StackSamples.of_all(slices)
@@ -102,7 +104,7 @@ def planted(
     return cost, truth
 
 
-@pytest.mark.parametrize("interleave", [1, 2, 3])
+@pytest.mark.parametrize("interleave", range(1, 8))
 def test_planted_jerks_and_interleave_are_found(interleave: int) -> None:
     cost, truth = planted(interleave, np.repeat([1, 4, 2], [9, 7, 8]))
     segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
