@@ -21,6 +21,11 @@ INTERLEAVES = tuple(range(1, 8))
 """Interleaves to try; the first of equally good ones is taken. Scanners take every second slice, or one of as many as
 there are packages; some step by the root of the number of slices, which is 7 for 48."""
 
+USUAL_INTERLEAVE = 3
+UNUSUAL_PENALTY = 20.0
+"""Cost (log odds) of an interleave above the usual ones. Few slices follow some order of seven by chance; those that
+were taken in an unusual order say so by far more than this."""
+
 HEAD_RADIUS_MM = 30.0
 """Half the diameter of a typical head, by which rotations are compared with translations."""
 
@@ -70,6 +75,11 @@ def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
     }
 
 
+def order_penalty(interleave: int) -> float:
+    """Cost of an order before anything was seen of the motion."""
+    return UNUSUAL_PENALTY if interleave > USUAL_INTERLEAVE else 0.0
+
+
 def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distance [A, B] between where motions a and b take a ball of `HEAD_RADIUS_MM`.
 
@@ -114,6 +124,21 @@ def best_segments(
         keep: candidates to consider besides those that `promising` picks.
     """
     orders = time_orders(slice_index)
+    usual = {n: order for n, order in orders.items() if n <= USUAL_INTERLEAVE}
+    unusual = {n: order for n, order in orders.items() if n > USUAL_INTERLEAVE}
+    best = _best_of_orders(cost, motion, usual, center_mm, keep)
+    other = _best_of_orders(cost, motion, unusual, center_mm, keep)
+    return other if other.cost + UNUSUAL_PENALTY < best.cost else best
+
+
+def _best_of_orders(
+    cost: NDArray[np.float64],
+    motion: RigidPose,
+    orders: dict[int, NDArray[np.int64]],
+    center_mm: NDArray[np.float64],
+    keep: NDArray[np.int64] | None,
+) -> Segments:
+    """The cheapest sequence in some of the orders of `time_orders`; arguments as of `best_segments`."""
     chosen = promising(cost, orders)
     if keep is not None:
         chosen = np.union1d(chosen, keep)
@@ -177,7 +202,8 @@ def estimate_interleave(motion: RigidPose, slice_index: NDArray[np.int64], cente
         center_mm: [3] centre of the head before the motions.
     """
     penalties = {
-        n: transition_penalty(changes_in_time(motion, slice_index, center_mm, n)) for n in time_orders(slice_index)
+        n: order_penalty(n) + transition_penalty(changes_in_time(motion, slice_index, center_mm, n))
+        for n in time_orders(slice_index)
     }
     return min(penalties, key=lambda n: penalties[n])
 
