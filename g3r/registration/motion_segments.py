@@ -23,8 +23,8 @@ there are packages; some step by the root of the number of slices, which is 7 fo
 
 USUAL_INTERLEAVE = 3
 UNUSUAL_PENALTY = 20.0
-"""Cost (log odds) of an interleave above the usual ones. Few slices follow some order of seven by chance; those that
-were taken in an unusual order say so by far more than this."""
+"""Cost (log odds) of an interleave above the usual ones, since few slices follow some order of seven by chance. Set on
+two such sets of `stress.drawn`, and two heads whose every fifth slice was taken in turn (docs/stress.md)."""
 
 HEAD_RADIUS_MM = 30.0
 """Half the diameter of a typical head, by which rotations are compared with translations."""
@@ -114,7 +114,7 @@ def best_segments(
     center_mm: NDArray[np.float64],
     keep: NDArray[np.int64] | None = None,
 ) -> Segments:
-    """The cheapest sequence of candidate motions for one stack.
+    """The cheapest sequence of candidate motions for one stack, in an unusual order only if that costs much less.
 
     Args:
         cost: [K, J] of slice k under candidate j (negative log likelihood).
