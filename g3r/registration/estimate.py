@@ -18,9 +18,9 @@ from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.handedness import handedness
+from g3r.registration.head_movement import median_moves_mm, segments_of
 from g3r.registration.held_out import held_out_score
 from g3r.registration.intruder import misfit_without_each
-from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time, estimate_interleave
 from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
@@ -54,6 +54,7 @@ class Registration:
         initialisations: held-out correlation of every initialisation, stack by stack.
         interleave: of each stack, as its motion suggests; None for a rigid stack.
         n_segments: motion segments of each stack; 1 for a rigid stack.
+        median_move_mm: movement of the head from slice to slice of each stack, see `median_moves_mm`.
         orientation: the standard orientation; None where the result stays in the scanner frame.
         history: figures of each round.
         profiles: of each stack, missing slices included.
@@ -73,6 +74,7 @@ class Registration:
     initialisations: dict[str, list[float]]
     interleave: list[int | None]
     n_segments: list[int]
+    median_move_mm: list[float]
     orientation: Orientation | None
     history: list[dict[str, float]] = field(default_factory=list)
     profiles: list[AreaProfile] = field(default_factory=list)
@@ -135,6 +137,7 @@ def register(
         initialisations=found.initialisations,
         interleave=interleave,
         n_segments=n_segments,
+        median_move_mm=median_moves_mm(samples, fitted.slices.world_from_header()),
         orientation=orientation,
         history=fitted.history,
         profiles=[sample.profile for sample in samples],
@@ -187,15 +190,14 @@ def measured_again(registration: Registration, fill: PlacedHead | None = None) -
     slices = bias_corrected(registration.slices)
     samples = StackSamples.of_all(slices)
     profiles = [sample.profile for sample in samples]
-    if len(samples) == 1:
-        return replace(registration, profiles=profiles)
-    missing = any(profile.has_missing for profile in profiles)
     motion = slices.world_from_header()
+    registration = replace(registration, profiles=profiles, median_move_mm=median_moves_mm(samples, motion))
+    if len(samples) == 1:
+        return registration
+    missing = any(profile.has_missing for profile in profiles)
     score = held_out_score(slices, samples, motion, fill if missing else None)
     overlap = overlap_of(slices, samples, motion) if missing else None
-    return replace(
-        registration, held_out=score.agreements(samples, registration.weight), profiles=profiles, overlap=overlap
-    )
+    return replace(registration, held_out=score.agreements(samples, registration.weight), overlap=overlap)
 
 
 def _with_rigid_stacks(
@@ -262,23 +264,3 @@ def _fit_badly(placed: FittedSlices, rows: NDArray[np.int64]) -> NDArray[np.bool
     """
     n_pixels = np.bincount(placed.slices.pixel_plane, minlength=len(placed.slices))[rows]
     return (placed.weight[rows] < DOWNWEIGHTED_BELOW) & (n_pixels > np.median(n_pixels) / 2)
-
-
-def segments_of(
-    samples: list[StackSamples], motion: RigidPose, same_mm: float = SAME_PLACE_MM
-) -> tuple[list[int], list[int | None]]:
-    """Number of motion segments of each stack, and the interleave under which its motions change least.
-
-    Args:
-        samples: the thinned pixels of each stack.
-        motion: [K] world from header of all slices.
-        same_mm: movements between consecutive slices up to this do not start a new segment.
-    """
-    n_segments, interleave = [], list[int | None]()
-    for sample in samples:
-        own = motion.take(sample.rows)
-        order = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
-        moves = changes_in_time(own, sample.slice_index, sample.pixels.center_mm, order)
-        n_segments.append(1 + int((moves > same_mm).sum()))
-        interleave.append(order if n_segments[-1] > 1 else None)
-    return n_segments, interleave

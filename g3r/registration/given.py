@@ -15,7 +15,8 @@ from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, present_orientation, standard_orientation
 from g3r.registration.atlas_search import AtlasPlacement, place_in_atlas, template_fits
 from g3r.registration.bias_correction import bias_corrected
-from g3r.registration.estimate import Registration, segments_of
+from g3r.registration.estimate import Registration
+from g3r.registration.head_movement import median_moves_mm, segments_of
 from g3r.registration.held_out import held_out_score
 from g3r.registration.overlap import overlap_of
 from g3r.registration.settings import RegistrationSettings
@@ -122,6 +123,7 @@ def measure(
         initialisations={},
         interleave=interleave,
         n_segments=n_segments,
+        median_move_mm=median_moves_mm(samples, motion),
         orientation=orientation,
         history=fitted.history,
         profiles=[sample.profile for sample in samples],

@@ -69,6 +69,7 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             held_out_correlation=held_out,
             median_slice_ncc=ncc,
             downweighted_share=downweighted,
+            median_move_mm=registration.median_move_mm[place],
             overlap_share=share,
             overlap_correlation=correlation,
             handedness=None if registration.handedness is None else registration.handedness[place],

@@ -32,6 +32,8 @@ class StackQuality:
         held_out_correlation: with a volume of the other stacks; None for a single stack.
         median_slice_ncc: of its slices with the volume of all; None without slices.
         downweighted_share: share of slices with a weight below one half.
+        median_move_mm: movement of the head from one of its slices to the next in time, median (`head_movement`); None
+            without slices.
         n_missing: number of missing slices between acquired ones.
         longest_gap_mm: length of the longest gap between acquired slices.
         is_cut: whether the field of view cut the head.
@@ -50,6 +52,7 @@ class StackQuality:
     held_out_correlation: float | None
     median_slice_ncc: float | None
     downweighted_share: float
+    median_move_mm: float | None = None
     n_missing: int = 0
     longest_gap_mm: float = 0.0
     is_cut: bool = False

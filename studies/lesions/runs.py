@@ -164,6 +164,7 @@ def true_motion(stacks: list[SimulatedStack]) -> Registration:
         initialisations={},
         interleave=[None] * n,
         n_segments=[1] * n,
+        median_move_mm=[0.0] * n,
         orientation=None,
     )
 

@@ -36,10 +36,12 @@ def outcome(case: SimulatedCase, options: argparse.Namespace) -> Row:
     error, verdict = case.pose_error(result.slices), verdict_of(result.record)
     psnr_db = aligned(case, result.volume, result.grid, error.common).scores.psnr_db
     off = off_share(error.per_slice_mm, result.slices, result.weight)
+    moves_mm = [stack.quality.median_move_mm or 0.0 for stack in result.record.stacks if stack.quality]
     return {
         "psnr_db": round(psnr_db, 3),
         "median_mm": round(error.median_mm, 4),
         "off_share": round(off, 4),
+        "median_move_mm": round(max(moves_mm), 2),
         "word": verdict.word,
         "reason": verdict.line(),
         "left_out": [stack.name for stack in result.record.stacks if stack.quality and stack.quality.left_out],

@@ -56,6 +56,7 @@ def registered(stacks: list[Stack]) -> tuple[Registration, float]:
         initialisations={},
         interleave=[None] * len(stacks),
         n_segments=[1] * len(stacks),
+        median_move_mm=[0.0] * len(stacks),
         orientation=None,
     ), intensity
 

@@ -40,6 +40,7 @@ def registration_of(slices: Slices) -> Registration:
         initialisations={},
         interleave=[None] * 3,
         n_segments=[1] * 3,
+        median_move_mm=[0.0] * 3,
         orientation=None,
     )
 

@@ -6,7 +6,7 @@ from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.estimate import segments_of
+from g3r.registration.head_movement import segments_of
 from g3r.registration.held_out import held_out_score, predict, volume_without
 from g3r.registration.motion_segments import head_distance_mm
 from g3r.registration.placement import refine_placement
