@@ -75,9 +75,9 @@ def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
     }
 
 
-def order_penalty(interleave: int) -> float:
-    """Cost of an order before anything was seen of the motion."""
-    return UNUSUAL_PENALTY if interleave > USUAL_INTERLEAVE else 0.0
+def order_penalty(interleave: int, usual: int = USUAL_INTERLEAVE) -> float:
+    """Cost of an order before anything was seen of the motion; orders up to `usual` cost nothing."""
+    return UNUSUAL_PENALTY if interleave > usual else 0.0
 
 
 def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,16 +193,19 @@ def transition_penalty(distance_mm: NDArray[np.float64]) -> float:
     return float(_penalty(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
 
 
-def estimate_interleave(motion: RigidPose, slice_index: NDArray[np.int64], center_mm: NDArray[np.float64]) -> int:
+def estimate_interleave(
+    motion: RigidPose, slice_index: NDArray[np.int64], center_mm: NDArray[np.float64], usual: int = USUAL_INTERLEAVE
+) -> int:
     """The interleave under which the motions of a stack change least.
 
     Args:
         motion: [K] world from header.
         slice_index: [K] numbers of the slices in their stack.
         center_mm: [3] centre of the head before the motions.
+        usual: interleaves above this are taken only where they explain much more.
     """
     penalties = {
-        n: order_penalty(n) + transition_penalty(changes_in_time(motion, slice_index, center_mm, n))
+        n: order_penalty(n, usual) + transition_penalty(changes_in_time(motion, slice_index, center_mm, n))
         for n in time_orders(slice_index)
     }
     return min(penalties, key=lambda n: penalties[n])

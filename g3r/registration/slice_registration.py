@@ -2,37 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import orthonormal, rotation_matrix
 from g3r.registration.normal_equations import NormalEquations, SampledSlices
+from g3r.registration.slice_neighbours import NeighbourTie, neighbours
 
 MAX_ROTATION_RAD, MAX_TRANSLATION_MM = 0.06, 2.0
 """Trust region of one step of a slice."""
 
 GAIN_PRIOR_SIGMA = 0.3
 """Standard deviation of the prior on the logarithm of slice gains; keeps dark slices finite."""
-
-NEIGHBOURS = (-2, -1, 1, 2)
-"""Offsets of the slices of a stack that count as neighbours."""
-
-TIE_SHARE = 0.01
-"""Stiffness of the tie between neighbours, as a share of the median stiffness of a slice: it hardly affects a slice
-through the middle of the head, while a slice of a few pixels at the edge follows its neighbours."""
-
-UNSEEN_NORMAL_TIE = 0.3
-"""The same along the normal of a slice that no other stack sees: the volume there was made of the slice and its
-neighbours, and nothing else determines how far they are apart."""
-
-TIE_REACH_MM = 3.0
-"""Neighbours whose motion would move a slice further than this count less: after a jerk, and between the
-passes of an interleaved stack, neighbours rightly lie elsewhere."""
 
 
 def register_slices(
@@ -52,7 +35,7 @@ def register_slices(
         gain: [K] present intensity factors.
         n_steps: number of evaluations.
         width: residual at which the Cauchy loss bends.
-        normal_tie: [K] further stiffness of the tie along the normal, see `UNSEEN_NORMAL_TIE`.
+        normal_tie: [K] further stiffness of the tie along the normal, see `NeighbourTie.of`.
 
     Returns:
         Slices in new poses, new gains, and the statistics at them.
@@ -81,7 +64,7 @@ def register_slices(
 def try_neighbours(
     model: SampledSlices, slices: Slices, gain: NDArray[np.float64], *, width: float
 ) -> tuple[Slices, int]:
-    """Give every slice the motion of a neighbour in the stack where that fits clearly better.
+    """Give every slice the motion of a neighbour where that fits clearly better.
 
     A slice in a wrong local minimum sees no gradient towards its place; its neighbours are mostly near it.
 
@@ -98,89 +81,14 @@ def try_neighbours(
     best_pose = slices.planes.pose
     current = model.losses(slices.planes, gain, width)
     best = current.copy()
-    for step in NEIGHBOURS:
-        source = np.arange(len(slices)) + step
-        valid = (source >= 0) & (source < len(slices))
-        source = np.where(valid, source, np.arange(len(slices)))
-        valid &= slices.stack_id[source] == slices.stack_id
-        source = np.where(valid, source, np.arange(len(slices)))
+    for source in neighbours(slices):
         candidate = motion.take(source) @ slices.header_pose
         loss = model.losses(slices.planes.with_pose(candidate), gain, width)
         # a margin, because each slice helped to make the volume and so fits best where it is
-        better = valid & (loss < 0.97 * best)
+        better = loss < 0.97 * best
         best_pose = _where(better, candidate, best_pose)
         best = np.where(better, loss, best)
     return slices.with_pose(best_pose), int((best < current).sum())
-
-
-@dataclass(frozen=True)
-class NeighbourTie:
-    """A quadratic penalty that ties every slice to where its neighbours in the stack would put it.
-
-    Args:
-        target: [K] mean of the neighbours' motions, weighted by how well each is determined, applied to the
-            header pose of the slice.
-        precision: [K, 6] of rotations (1/rad^2) and translations (1/mm^2), in units of the squared residuals.
-    """
-
-    target: RigidPose
-    precision: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls, slices: Slices, equations: NormalEquations, normal_tie: NDArray[np.float64] | None = None
-    ) -> NeighbourTie:
-        """Ties for the present poses.
-
-        Args:
-            slices: K slices.
-            equations: of their fit.
-            normal_tie: [K] see `UNSEEN_NORMAL_TIE`.
-        """
-        n = len(slices)
-        motion = slices.world_from_header()
-        pose = slices.planes.pose
-        information = np.einsum("kii->k", equations.hessian[:, 3:6, 3:6]) / 3
-        # a rotation counts by how far it moves the edge of the slice; slices of a few pixels get a least radius
-        half_mm = slices.planes.shape * slices.planes.spacing_mm / 2
-        radius_mm = np.maximum(np.sqrt((half_mm**2).mean(1)), 10.0)
-        rotation = np.zeros((n, 3, 3))
-        translation, total = np.zeros((n, 3)), np.zeros(n)
-        for step in NEIGHBOURS:
-            source = np.arange(n) + step
-            valid = (source >= 0) & (source < n)
-            source = np.clip(source, 0, n - 1)
-            valid &= slices.stack_id[source] == slices.stack_id
-            candidate = motion.take(source) @ slices.header_pose
-            angle = Rotation.from_matrix(pose.rotation.transpose(0, 2, 1) @ candidate.rotation).magnitude()
-            shift_mm = np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1)
-            away_mm = np.hypot(shift_mm, radius_mm * angle)
-            weight = np.where(valid, information[source] / (1 + (away_mm / TIE_REACH_MM) ** 2), 0.0)
-            rotation += weight[:, None, None] * candidate.rotation
-            translation += weight[:, None] * candidate.translation_mm
-            total += weight
-        alone = total <= 0
-        safe = np.where(alone, 1.0, total)
-        target = RigidPose(
-            orthonormal(np.where(alone[:, None, None], pose.rotation, rotation / safe[:, None, None])),
-            np.where(alone[:, None], pose.translation_mm, translation / safe[:, None]),
-        )
-        stiffness = np.where(alone, 0.0, TIE_SHARE * float(np.median(information)))
-        precision = np.repeat(np.stack([stiffness * radius_mm**2, stiffness], axis=1), 3, axis=1)
-        if normal_tie is not None:
-            precision[:, 5] += np.where(alone, 0.0, normal_tie * float(np.median(information)))
-        return cls(target, precision)
-
-    def twist(self, pose: RigidPose) -> NDArray[np.float64]:
-        """Body-frame rotation and translation [K, 6] from poses to the target."""
-        back = pose.rotation.transpose(0, 2, 1)
-        rotation = Rotation.from_matrix(back @ self.target.rotation).as_rotvec()
-        translation = np.einsum("kij,kj->ki", back, self.target.translation_mm - pose.translation_mm)
-        return np.concatenate([rotation, translation], axis=1)
-
-    def cost(self, pose: RigidPose) -> NDArray[np.float64]:
-        """Penalty of each slice [K]."""
-        return 0.5 * (self.precision * self.twist(pose) ** 2).sum(1)
 
 
 def _objective(equations: NormalEquations, width: float) -> NDArray[np.float64]:

@@ -19,7 +19,8 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import best_gain
-from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
+from g3r.registration.slice_neighbours import UNSEEN_NORMAL_TIE
+from g3r.registration.slice_registration import register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
 from g3r.run.deadline import Deadline, timed_steps
 from g3r.run.progress import Progress, no_progress

@@ -21,6 +21,9 @@ MASK_FROM = {
     "automatic": "found by the network",
     "command": "found by the user's command",
 }
+LEAST_MOVE_MM = 0.1
+"""Median movements below this are not told."""
+
 SCALE_FROM = 0.3
 """Agreement at the left end of the scale; the right end is 1."""
 
@@ -39,7 +42,7 @@ class StackRow:
         agreement: correlation with the other stacks, as text.
         place: position of the agreement on the scale, 0 to 1; None if nothing was compared.
         judgement: "good", "doubtful", "bad", "left out" or "not checked".
-        segments: how often the head jumped while it was acquired, in words.
+        motion: how the head moved while it was acquired, in words; empty if it did not.
     """
 
     name: str
@@ -54,7 +57,7 @@ class StackRow:
     agreement: str
     place: float | None
     judgement: str
-    segments: str
+    motion: str
 
 
 def scale_ends() -> tuple[float, float]:
@@ -83,14 +86,17 @@ def _row(stack: StackRecord) -> StackRow:
         agreement="-" if found is None else f"{found:.2f}",
         place=None if found is None else _place(found),
         judgement=_judgement(stack, found),
-        segments=_jumps((stack.n_segments or 1) - 1),
+        motion=_motion((stack.n_segments or 1) - 1, quality.median_move_mm if quality else None),
     )
 
 
-def _jumps(n: int) -> str:
-    if n == 0:
-        return ""
-    return "the head jumped once" if n == 1 else f"the head jumped {n} times"
+def _motion(n_jumps: int, median_mm: float | None) -> str:
+    said = []
+    if n_jumps:
+        said.append("the head jumped once" if n_jumps == 1 else f"the head jumped {n_jumps} times")
+    if median_mm is not None and median_mm >= LEAST_MOVE_MM:
+        said.append(f"{median_mm:.1f} mm from slice to slice")
+    return ", ".join(said)
 
 
 def _judgement(stack: StackRecord, found: float | None) -> str:

@@ -16,7 +16,7 @@ from g3r.planning.anatomy import NAME_OF
 from g3r.planning.stages import Stage
 from g3r.registration.quality import JUDGED, PARALLEL, misfit, nearly_parallel
 from g3r.registration.stack_quality import is_mirrored, rounded_down, shortfalls, unlike_others
-from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import MAX_MEDIAN_MOVE_MM, MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 from g3r.report.verdict_messages import HEADLINES, MESSAGES, MILDEST_FIRST, USE, Word
 
 if TYPE_CHECKING:
@@ -158,6 +158,8 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
         yield "stack not used" if quality.median_slice_ncc is None else "stack failed", facts | {"shortfalls": why}
     elif quality.held_out_correlation is not None and quality.held_out_correlation < RETRY_BELOW_CORRELATION:
         yield "stack doubtful", facts | {"good": RETRY_BELOW_CORRELATION}
+    if quality.median_move_mm is not None and quality.median_move_mm > MAX_MEDIAN_MOVE_MM:
+        yield "stack jumps", facts | {"mm": f"{quality.median_move_mm:.1f}", "good": MAX_MEDIAN_MOVE_MM}
 
 
 def _unlike_others(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:

@@ -72,6 +72,13 @@ MESSAGES = {
         "the slices of {stack} agree with the volume by {ncc}, those of another stack by {best}",
         "Check that the stack shows the same head on the same day, and look at its slices below.",
     ),
+    "stack jumps": Message(
+        CHECK,
+        "the slices of {stack} are placed as if the head had moved by {mm} mm from one to the next (median; good is "
+        "{good:g} and below)",
+        "Heads move less from one slice to the next. Slices may be in wrong places, or in an order that g3r does not "
+        "try: look for doubled edges in the volume, and at the slices below.",
+    ),
     "unseen": Message(CHECK, "{line}", "Nothing can be said of a lesion there; the part is outlined in the viewer."),
     "volume check": Message(CHECK, "{line}", "Look at the slices below: measured and predicted should be alike."),
     "rollbacks": Message(

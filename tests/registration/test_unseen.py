@@ -13,7 +13,7 @@ from g3r.registration.held_out import coverage_without, held_out_score, volume_w
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.overlap import overlap_of
 from g3r.registration.similarity import StackSamples
-from g3r.registration.slice_registration import NeighbourTie
+from g3r.registration.slice_neighbours import NeighbourTie
 from g3r.registration.unseen import coverage_share, filled_with_head, grid_with_head, sampled, with_header_spans
 
 

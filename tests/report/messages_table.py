@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from g3r.bench.record import markdown_table, put_between_markers
-from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import MAX_MEDIAN_MOVE_MM, MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, MESSAGES, USE
 from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
 from tests.rooms import REPOSITORY
@@ -33,7 +33,12 @@ FILLED_IN = {
     "shortfalls": "what is bad of it, and what is good",
 }
 
-GOOD = {"stack mirrored": MIRRORED_BELOW, "perhaps mirrored": MIRRORED_BELOW, "stacks parallel": MIN_CROSSING_DEG}
+GOOD = {
+    "stack mirrored": MIRRORED_BELOW,
+    "perhaps mirrored": MIRRORED_BELOW,
+    "stack jumps": MAX_MEDIAN_MOVE_MM,
+    "stacks parallel": MIN_CROSSING_DEG,
+}
 """Limits of messages; the others use the limit of the agreement."""
 
 LINES = {

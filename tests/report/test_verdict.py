@@ -25,6 +25,7 @@ from g3r.registration.quality import (
     WITHOUT_SLICES,
     pose_warnings,
 )
+from g3r.registration.thresholds import MAX_MEDIAN_MOVE_MM
 from g3r.report.verdict import verdict_of
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE
 from g3r.run.context import StoppedAt
@@ -120,6 +121,12 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         CHECK,
         "the slices of c.nii agree with the volume by 0.82, those of another stack by 0.95",
     ),
+    "jumps": (
+        stacks_with(stack("c.nii", quality(True, median_move_mm=MAX_MEDIAN_MOVE_MM + 1.26))),
+        CHECK,
+        f"the slices of c.nii are placed as if the head had moved by {MAX_MEDIAN_MOVE_MM + 1.3:.1f} mm from one to the",
+    ),
+    "moves": (stacks_with(stack("c.nii", quality(True, median_move_mm=MAX_MEDIAN_MOVE_MM))), USE, "use: 3 of 3 stacks"),
     "parallel": (
         crossing(13.2),
         CHECK,
