@@ -24,7 +24,7 @@ from g3r.registration.held_out import fine_volume_without
 from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.similarity import SearchPixels, random_climb
 from g3r.registration.slice_registration import register_slices
-from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, STANDS_APART, STANDS_OUT
+from g3r.registration.thresholds import LEAST_SHARE, MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, STANDS_APART, STANDS_OUT
 
 logger = logging.getLogger(__name__)
 
@@ -53,10 +53,13 @@ class Asymmetry:
     Args:
         correlation: of its pixels with the antisymmetric part of the head.
         error: its standard error.
+        share: of the antisymmetric part as the others show it, how much the stack shows, too: 1 if both are the same
+            and without noise, -1 for a mirror image, 0 if that part is none of the head's.
     """
 
     correlation: float
     error: float
+    share: float
 
     @property
     def highest(self) -> float:
@@ -106,8 +109,9 @@ def _stands_out(one: Asymmetry, others: Sequence[Asymmetry | None]) -> bool:
         return False
     usual = mean(other.correlation for other in known)
     error = sum(other.error**2 for other in known) ** 0.5 / len(known)
+    has_sides = all(other.share > LEAST_SHARE for other in known)
     below_zero = one.correlation < -STANDS_OUT * one.error
-    return below_zero and usual > error and one.correlation < usual - STANDS_APART * float(np.hypot(one.error, error))
+    return has_sides and below_zero and one.correlation < usual - STANDS_APART * float(np.hypot(one.error, error))
 
 
 def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry | None:
@@ -169,7 +173,8 @@ def antisymmetric_correlation(
         or np.corrcoef(value, both[:, 1])[0, 1] ** 2 < MIN_CORRELATION**2
     ):
         return None
-    left = targets - both @ np.linalg.lstsq(both, targets, rcond=None)[0]
+    fit = np.linalg.lstsq(both, targets, rcond=None)[0]
+    left = targets - both @ fit
     products = np.stack([left[:, 0] ** 2, left[:, 1] ** 2, left[:, 0] * left[:, 1]])
     sums = np.stack([np.bincount(plane, one) for one in products])[:, np.unique(plane)]
     without_one = sums.sum(1)[:, None] - sums  # [3, K] of all slices but one
@@ -177,4 +182,7 @@ def antisymmetric_correlation(
         return None
     n, correlations = sums.shape[1], without_one[2] / np.sqrt(without_one[0] * without_one[1])
     error = float(np.sqrt((n - 1) * correlations.var()))
-    return Asymmetry(float(sums[2].sum() / np.sqrt(sums[0].sum() * sums[1].sum())), error)
+    square, square_of_part, product = sums.sum(1)
+    # both parts of a stack are as bright as it is, so the share is in units of its symmetric part
+    share = product / square_of_part / fit[1, 0] if fit[1, 0] else 0.0
+    return Asymmetry(float(product / np.sqrt(square * square_of_part)), error, float(share))

@@ -14,7 +14,7 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.handedness import Asymmetry, antisymmetric_correlation, handedness
-from g3r.registration.thresholds import MIRRORED_BELOW
+from g3r.registration.thresholds import LEAST_SHARE, MIRRORED_BELOW
 from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed
 
 
@@ -88,18 +88,20 @@ def test_what_the_others_saw_on_one_side_alone_is_no_mirror_image(still: list[Si
     assert of_first > 0.05
 
 
-LOW = Asymmetry(-0.08, 0.03)
+LOW = Asymmetry(-0.08, 0.03, -0.3)
+CLEAR = Asymmetry(0.1, 0.02, 0.4)
+NOT_SAID = [None, CLEAR.highest, CLEAR.highest]
 
 
 @pytest.mark.parametrize(
     ("one", "others", "hands"),
     [
-        (LOW, [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [LOW.highest, 0.1, 0.12]),
-        (LOW, [Asymmetry(0.0, 0.02), Asymmetry(0.0, 0.02)], [None, 0.12, 0.12]),
-        (Asymmetry(-0.051, 0.018), [Asymmetry(0.043, 0.016), Asymmetry(0.036, 0.02)], [None, 0.12, 0.12]),
-        (Asymmetry(-0.09, 0.05), [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [None, 0.12, 0.12]),
-        (LOW, [None, None], [None, 0.12, 0.12]),
-        (Asymmetry(-0.03, 0.02), [Asymmetry(0.1, 0.01), Asymmetry(0.1, 0.01)], [-0.01, 0.12, 0.12]),
+        (LOW, [Asymmetry(0.08, 0.02, 0.3), CLEAR], [LOW.highest, 0.1, 0.12]),
+        (LOW, [Asymmetry(0.08, 0.02, LEAST_SHARE), CLEAR], NOT_SAID),
+        (Asymmetry(-0.051, 0.018, -0.3), [Asymmetry(0.043, 0.016, 0.3), Asymmetry(0.036, 0.02, 0.3)], NOT_SAID),
+        (Asymmetry(-0.09, 0.05, -0.3), [Asymmetry(0.08, 0.02, 0.3), CLEAR], NOT_SAID),
+        (LOW, [None, None], NOT_SAID),
+        (Asymmetry(-0.03, 0.02, -0.3), [CLEAR, CLEAR], [-0.01, 0.12, 0.12]),
     ],
     ids=[
         "mirrored",
@@ -120,7 +122,7 @@ def test_a_mirror_image_is_called_so_where_the_others_show_that_the_head_has_sid
     def of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry | None:
         if stack == 0:
             return one
-        return Asymmetry(0.1, 0.02) if slices.n_stacks > 2 else others[stack - 1]
+        return CLEAR if slices.n_stacks > 2 else others[stack - 1]
 
     monkeypatch.setattr("g3r.registration.handedness._of_stack", of_stack)
     slices = as_slices(still)[0]
@@ -146,6 +148,18 @@ def test_slices_that_do_not_agree_say_less(spread: float) -> None:
     assert found.correlation == pytest.approx(np.corrcoef(left, odd)[0, 1], abs=0.01)
     assert found.error == pytest.approx(error, abs=0.01)
     assert found.highest == found.correlation + found.error
+
+
+@pytest.mark.parametrize("hand", [1.0, -1.0, 0.3])
+@pytest.mark.parametrize("brightness", [1.0, 40.0])
+def test_the_share_is_how_much_of_the_sides_a_stack_shows(hand: float, brightness: float) -> None:
+    rng = np.random.default_rng(0)
+    even, odd, noise = rng.normal(size=(3, 4000))
+    value = brightness * (even + hand * odd + 0.2 * noise)
+    y, a, b = (one.astype(np.float32) for one in (value, even + odd, even - odd))
+    found = antisymmetric_correlation(y, a, b, np.repeat(np.arange(20), 200))
+    assert found is not None
+    assert found.share == pytest.approx(hand, abs=0.03)
 
 
 def test_an_even_stack_is_no_error(still: list[SimulatedStack]) -> None:
