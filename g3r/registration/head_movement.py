@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g3r.geometry import RigidPose
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time, estimate_interleave
@@ -22,11 +23,8 @@ def segments_of(
         same_mm: movements between consecutive slices up to this do not start a new segment.
     """
     n_segments, interleave = [], list[int | None]()
-    for sample in samples:
-        own = motion.take(sample.rows)
-        order = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
-        moves = changes_in_time(own, sample.slice_index, sample.pixels.center_mm, order)
-        n_segments.append(1 + int((moves > same_mm).sum()))
+    for order, moves_mm in (_in_time(sample, motion) for sample in samples):
+        n_segments.append(1 + int((moves_mm > same_mm).sum()))
         interleave.append(order if n_segments[-1] > 1 else None)
     return n_segments, interleave
 
@@ -40,10 +38,12 @@ def median_moves_mm(samples: Sequence[StackSamples], motion: RigidPose) -> list[
         samples: the thinned pixels of each stack.
         motion: [K] world from header of all slices.
     """
-    found = []
-    for sample in samples:
-        own = motion.take(sample.rows)
-        order = estimate_interleave(own, sample.slice_index, sample.pixels.center_mm)
-        moves = changes_in_time(own, sample.slice_index, sample.pixels.center_mm, order)
-        found.append(float(np.median(moves)) if moves.size else 0.0)
-    return found
+    moves_mm = [_in_time(sample, motion)[1] for sample in samples]
+    return [float(np.median(moves)) if moves.size else 0.0 for moves in moves_mm]
+
+
+def _in_time(sample: StackSamples, motion: RigidPose) -> tuple[int, NDArray[np.float64]]:
+    """The interleave under which the motions of a stack change least, and the movements (mm) in that order."""
+    own, center_mm = motion.take(sample.rows), sample.pixels.center_mm
+    interleave = estimate_interleave(own, sample.slice_index, center_mm)
+    return interleave, changes_in_time(own, sample.slice_index, center_mm, interleave)
