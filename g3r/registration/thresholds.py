@@ -77,10 +77,10 @@ On other pairs, made in the same way, a limit of 30 degrees had seemed enough.""
 
 MAX_MEDIAN_MOVE_MM = 3.5
 """Median movement of the head from slice to slice of a stack (`head_movement`) above which its poses are doubtful. In
-25 simulated heads in severe motion it was truly 0.8 to 1.6, and found as 0.8 to 1.7 where under 5 % of the brain was
-more than 2 mm off. Seven heads with 11 to 51 % off, whose stacks agreed nevertheless (0.57 to 0.83), had 3.7 to 6.9 in
-their worst stack. A stack whose halves were swapped had 3.7 (`fast`, by hand). Simulated heads jerk and drift; a head
-that turns all the time may exceed it in place."""
+25 simulated heads in severe motion it was truly 0.8 to 1.6, and found as 0.8 to 2.3 where under 5 % of the brain was
+more than 2 mm off. Seven heads with 11 to 51 % off after registration, whose stacks agreed nevertheless (0.57 to 0.83),
+had 3.7 to 6.9 in their worst stack. A stack whose halves were swapped had 3.7 (`fast`, by hand). Simulated heads jerk
+and drift; a head that turns all the time may exceed it in place."""
 
 MIN_MISFIT_WITHOUT = 0.6
 """A stack is an intruder if less than this share of the misfit of all others is left without it
