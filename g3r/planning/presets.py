@@ -113,7 +113,7 @@ class ReconstructionSettings:
 _BALANCED = ReconstructionSettings()
 
 _QUICK_SEARCH = replace(
-    _BALANCED.registration, n_candidates=800, network_as_reserve=True, stacks=False, attempts=1, steps_per_round=4
+    _BALANCED.registration, n_candidates=800, network_as_reserve=True, attempts=2, steps_per_round=4
 )
 
 PRESETS: dict[str, ReconstructionSettings] = {
@@ -129,6 +129,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         registration=replace(
             _QUICK_SEARCH,
             network=False,
+            attempts=1,
             n_rounds=6,
             stray_searches=1,
             finest_voxel_mm=1.1,

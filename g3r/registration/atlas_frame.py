@@ -15,7 +15,13 @@ from g3r.registration.atlas_search import ScaledTemplate
 from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.similarity import SearchPixels, correlation, random_climb
-from g3r.registration.so3_search import N_FOLLOWED_OF_STACK, N_ORIENTATIONS, STACK_DISTANCE_DEG, best_orientations
+from g3r.registration.so3_search import (
+    N_FOLLOWED,
+    N_FOLLOWED_OF_STACK,
+    N_ORIENTATIONS,
+    STACK_DISTANCE_DEG,
+    best_orientations,
+)
 from g3r.registration.thresholds import MIN_ATLAS_CORRELATION, MIN_RIVAL_MARGIN
 
 logger = logging.getLogger(__name__)
@@ -110,6 +116,20 @@ def present_orientation(slices: Slices, templates: Sequence[ScaledTemplate]) -> 
     return Orientation(pose=slices.planes.pose, correlation=best, weeks=template.weeks, scale=template.scale)
 
 
+def into_atlas(slices: Slices, motion: RigidPose, template: ScaledTemplate, rng: np.random.Generator) -> RigidPose:
+    """Motions [K] after the one further motion that all slices need to fit a template, in whatever orientation.
+
+    Args:
+        slices: K slices.
+        motion: [K] world from header, which holds them together.
+        template: atlas template of the subject's size.
+        rng: source of randomness.
+    """
+    pixels = SearchPixels.of(slices.with_motion(motion))
+    found = _in_all_orientations([template], pixels, rng, n_most=N_FOLLOWED, rounds=ROUNDS[:3])
+    return max(found, key=lambda one: one.correlation).motion @ motion
+
+
 @dataclass(frozen=True)
 class _Fit:
     """All slices moved to a template: their correlation with it, and the motion [1]."""
@@ -120,7 +140,11 @@ class _Fit:
 
 
 def _in_all_orientations(
-    templates: Sequence[ScaledTemplate], pixels: SearchPixels, rng: np.random.Generator
+    templates: Sequence[ScaledTemplate],
+    pixels: SearchPixels,
+    rng: np.random.Generator,
+    n_most: int = N_FOLLOWED_OF_STACK,
+    rounds: Sequence[tuple[float, float]] = ROUNDS,
 ) -> list[_Fit]:
     """Fits of the slices to each template, from the orientations in which they correlate best."""
     rotation = uniform_rotations(N_ORIENTATIONS)
@@ -128,9 +152,9 @@ def _in_all_orientations(
     for template in templates:
         motion = rotations_about(rotation, pixels.center_mm, template.center_mm)
         agreement = correlation(pixels.moments(template.volume, template.grid, motion, nearest=True).sum(1))
-        for base in best_orientations(rotation, agreement, N_FOLLOWED_OF_STACK, STACK_DISTANCE_DEG):
+        for base in best_orientations(rotation, agreement, n_most, STACK_DISTANCE_DEG):
             start = rotations_about(base[None], pixels.center_mm, template.center_mm)
-            found.append(_moved_to(template, pixels, start, ROUNDS, rng))
+            found.append(_moved_to(template, pixels, start, rounds, rng))
     return found
 
 

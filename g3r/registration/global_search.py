@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +11,9 @@ import numpy as np
 from g3r.acquisition.atlas_template import AtlasTemplate, PlacedHead
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.atlas_search import AtlasPlacement, place_in_atlas
-from g3r.registration.held_out import HeldOutScore, best_initialisation, held_out_score
+from g3r.registration.atlas_frame import into_atlas
+from g3r.registration.atlas_search import AtlasPlacement, ScaledTemplate, place_in_atlas
+from g3r.registration.held_out import HeldOutScore, held_out_score, held_out_scores
 from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments, rigid_or_segments
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
@@ -23,6 +24,7 @@ from g3r.registration.thresholds import (
     MIN_SINGLE_GAIN,
     MIN_SINGLE_GAIN_PER_SAMPLE,
     RETRY_BELOW_CORRELATION,
+    RETRY_WITH_TEMPLATE_BELOW,
 )
 from g3r.registration.unseen import with_header_spans
 from g3r.run.deadline import Deadline
@@ -52,6 +54,27 @@ class SearchResult:
 
 
 @dataclass(frozen=True)
+class _Starts:
+    """Initialisations: motions [K] and their held-out scores by name, the slices in the template, and that as fill."""
+
+    motion: dict[str, RigidPose]
+    score: dict[str, HeldOutScore]
+    placed: AtlasPlacement | None
+    fill: ScaledTemplate | None
+
+    def result(self, name: str, motion: RigidPose, score: HeldOutScore) -> SearchResult:
+        """A result of the search that started from one of these."""
+        return SearchResult(
+            motion=motion,
+            initialisation=name,
+            initialisations={key: value.correlations for key, value in self.score.items()},
+            placed=self.placed,
+            fill=self.fill,
+            score=score,
+        )
+
+
+@dataclass(frozen=True)
 class GlobalSearch:
     """The search for the poses of two or more stacks.
 
@@ -70,60 +93,81 @@ class GlobalSearch:
     def run(self, proposals: Mapping[str, RigidPose], deadline: Deadline | None = None) -> SearchResult:
         """Search until every stack is well predicted by the others, or the attempts are used up.
 
+        Each attempt begins at the next best initialisation, and the last one at the best motions so far, with all
+        others as candidates: segments that one attempt has missed another may have found.
+
         Args:
             proposals: motions [K] (world from header) by other means, by name.
             deadline: no attempt begins after it, and the first one ends by it if it can.
         """
-        initialisations = {"headers": RigidPose.identity(len(self.slices))}
-        if self.settings.network:
-            initialisations |= dict(proposals)
-        if self.settings.stacks:
-            initialisations["stacks"] = register_stacks(self.slices).world_from_header()
-        best: SearchResult | None = None
-        for attempt in range(max(1, self.settings.attempts)):
-            rng = np.random.default_rng([self.settings.seed, attempt])
-            found = self._attempt(initialisations, rng, deadline)
-            if best is None or _score(found).cost < _score(best).cost:
-                best = found
+        rng = np.random.default_rng([self.settings.seed, 0])
+        starts = self._starts(proposals, rng)
+        ranked = sorted(starts.motion, key=lambda name: starts.score[name].cost)
+        best = starts.result(ranked[0], starts.motion[ranked[0]], starts.score[ranked[0]])
+        found: list[RigidPose] = []
+        for attempt in range(max(1, self.settings.attempts) if self.settings.segments else 0):
+            combines = attempt > 1 and attempt == self.settings.attempts - 1
+            name = best.initialisation if combines else ranked[attempt % len(ranked)]
+            start, score = (best.motion, _score(best)) if combines else (starts.motion[name], starts.score[name])
+            others = found if combines else [motion for key, motion in starts.motion.items() if key != name]
+            motion, score = self._segments(name, start, score, others, starts.fill, rng, deadline)
+            found.append(motion)
+            if score.cost < _score(best).cost:
+                best = starts.result(name, motion, score)
             lowest = min(_score(best).correlations)
-            finished = lowest >= RETRY_BELOW_CORRELATION or not self.settings.segments
-            if finished or (deadline is not None and deadline.record_whether_passed()):
+            sure = RETRY_BELOW_CORRELATION if starts.fill is None else RETRY_WITH_TEMPLATE_BELOW
+            if lowest >= sure or (deadline is not None and deadline.record_whether_passed()):
                 break
+            rng = np.random.default_rng([self.settings.seed, attempt + 1])
             logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
-        assert best is not None
         return best
 
-    def _attempt(
-        self, initialisations: dict[str, RigidPose], rng: np.random.Generator, deadline: Deadline | None
-    ) -> SearchResult:
+    def _starts(self, proposals: Mapping[str, RigidPose], rng: np.random.Generator) -> _Starts:
         slices, samples, placed, fill = self.slices, self.samples, None, None
+        motions = {"headers": RigidPose.identity(len(slices))}
+        if self.settings.network:
+            motions |= dict(proposals)
+        if self.settings.stacks:
+            motions["stacks"] = register_stacks(slices).world_from_header()
         if self.template is not None:
             placed = place_in_atlas(slices, samples, self.template, rng)
             in_atlas = placed.motion(len(slices), samples)
             if any(sample.profile.has_missing for sample in samples):
                 # the template stands for what is missing, so every initialisation has to be in its frame
                 fill = placed.template
-                initialisations = {
-                    name: aligned_to(slices, in_atlas, motion) for name, motion in initialisations.items()
-                }
-            initialisations = {**initialisations, "template": in_atlas}
-        name, scores = best_initialisation(slices, samples, initialisations, fill)
-        motion, score = initialisations[name], scores[name]
-        if self.settings.segments:
-            others = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
-            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline, fill, score)
-            interleave = [placement.segments.interleave for placement in placements]
-            segmented = collapse_to_rigid(slices, samples, segmented, interleave, fill)
-            after = held_out_score(slices, samples, segmented, fill)
-            # with parts missing, segments gain less; a start from the template alone was not fitted to the other
-            # stacks, so any gain counts
-            needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN
-            if after.cost <= score.cost - needed:
-                motion, score = segmented, after
-        correlations = {key: value.correlations for key, value in scores.items()}
-        return SearchResult(
-            motion=motion, initialisation=name, initialisations=correlations, placed=placed, fill=fill, score=score
-        )
+                motions = {name: self._in_frame(motion, in_atlas, fill, rng) for name, motion in motions.items()}
+            motions["template"] = in_atlas
+        return _Starts(motions, held_out_scores(slices, samples, motions, fill), placed, fill)
+
+    def _in_frame(
+        self, motion: RigidPose, in_atlas: RigidPose, fill: ScaledTemplate, rng: np.random.Generator
+    ) -> RigidPose:
+        """Motions in the frame of the template: as the stacks were placed in it, or by a search of their own."""
+        aligned = aligned_to(self.slices, in_atlas, motion)
+        moved = into_atlas(self.slices, motion, fill, rng)
+        return min(aligned, moved, key=lambda one: held_out_score(self.slices, self.samples, one, fill).cost)
+
+    def _segments(
+        self,
+        name: str,
+        start: RigidPose,
+        score: HeldOutScore,
+        others: Sequence[RigidPose],
+        fill: ScaledTemplate | None,
+        rng: np.random.Generator,
+        deadline: Deadline | None,
+    ) -> tuple[RigidPose, HeldOutScore]:
+        """Motion segments that predict the stacks better than the motions to start from, or these; and their score."""
+        slices, samples = self.slices, self.samples
+        aligned = [aligned_to(slices, start, other) for other in others]
+        segmented, placements = refine_segments(slices, samples, start, aligned, rng, deadline, fill, score)
+        interleave = [placement.segments.interleave for placement in placements]
+        segmented = collapse_to_rigid(slices, samples, segmented, interleave, fill)
+        after = held_out_score(slices, samples, segmented, fill)
+        # with parts missing, segments gain less; a start from the template alone was not fitted to the other
+        # stacks, so any gain counts
+        needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN
+        return (segmented, after) if after.cost <= score.cost - needed else (start, score)
 
 
 def _score(found: SearchResult) -> HeldOutScore:

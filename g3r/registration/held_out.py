@@ -265,13 +265,13 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     return found
 
 
-def best_initialisation(
+def held_out_scores(
     slices: Slices,
     samples: list[StackSamples],
     initialisations: Mapping[str, RigidPose],
     fill: PlacedHead | None = None,
-) -> tuple[str, dict[str, HeldOutScore]]:
-    """The name of the initialisation with the lowest held-out cost, and the scores of all.
+) -> dict[str, HeldOutScore]:
+    """The scores of several initialisations.
 
     Args:
         slices: of two or more stacks.
@@ -283,4 +283,4 @@ def best_initialisation(
     for name, score in scores.items():
         correlations = " ".join(f"{one:.2f}" for one in score.correlations)
         logger.info("%s: held-out cost %.0f, correlation %s", name, score.cost, correlations)
-    return min(scores, key=lambda name: scores[name].cost), scores
+    return scores

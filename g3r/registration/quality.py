@@ -20,11 +20,10 @@ PARALLEL = "all stacks: their slices are nearly parallel in the head"
 
 LEFT_OUT = "left out of the volume"
 NO_SLICE = "no slice with enough masked pixels"
-PERHAPS_MIRRORED = "may be a mirror image of"
 PROBABLY_MIRRORED = "probably a mirror image of"
 FAILED = "registration probably failed"
 
-JUDGED = (LEFT_OUT, NO_SLICE, PERHAPS_MIRRORED, PROBABLY_MIRRORED, FAILED)
+JUDGED = (LEFT_OUT, NO_SLICE, PROBABLY_MIRRORED, FAILED)
 """Starts, after the stack's name, of warnings about a quality that the verdict has a message of its own for."""
 
 WITHOUT_SLICES = StackQuality(reliable=False, held_out_correlation=None, median_slice_ncc=None, downweighted_share=0.0)
@@ -75,8 +74,7 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             handedness=None if registration.handedness is None else registration.handedness[place],
             **missing,
         )
-        # with two stacks no third shows whether the head is asymmetric: the verdict asks the user to look
-        fails = bool(shortfalls(one)) or (is_mirrored(one) and len(present) > 2)
+        fails = bool(shortfalls(one)) or is_mirrored(one)
         found.append(one if held_out is None else replace(one, reliable=not fails))
     if registration.misfit_without is not None and all(found[n].reliable for n in present):
         # a failed stack is known to be wrong, and while it stays, others may gain without a sound one
@@ -100,11 +98,6 @@ def pose_warnings(qualities: Sequence[StackQuality], stacks: Sequence[Stack]) ->
         elif one.left_out:
             # a stack that merely does not fit does no harm once it is left out: `left_out_notes`
             lines += [f"{stack.name}: {LEFT_OUT}, {misfit(one)}"] if is_mirrored(one) else []
-        elif is_mirrored(one) and one.reliable:
-            lines.append(
-                f"{stack.name}: {PERHAPS_MIRRORED} what the other stack shows (handedness "
-                f"{rounded_down(one.handedness)}); compare both where the head is not symmetric"
-            )
         elif is_mirrored(one) and not shortfalls(one):
             lines.append(
                 f"{stack.name}: {PROBABLY_MIRRORED} what the other stacks show (handedness "

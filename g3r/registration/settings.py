@@ -16,7 +16,7 @@ class RegistrationSettings:
         stacks: initialisation by stacks registered to each other from many starts.
         segments: place motion segments again in the volume of the other stacks.
         n_candidates: random motions tried at once for a stack in the search.
-        attempts: at most this many searches, each with other random numbers, while stacks do not predict each other.
+        attempts: at most this many searches for motion segments, while stacks do not predict each other well.
         n_rounds: alternations of volume and slices; 0 leaves the slices at their motion segments.
         stray_searches: after the rounds, at most this many searches for slices that went astray; more rounds follow
             each search that found some.
@@ -37,7 +37,7 @@ class RegistrationSettings:
     stacks: bool = True
     segments: bool = True
     n_candidates: int = 4000
-    attempts: int = 3
+    attempts: int = 4
     n_rounds: int = 12
     stray_searches: int = 3
     steps_per_round: int = 5

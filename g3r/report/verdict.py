@@ -67,7 +67,7 @@ def verdict_of(record: RunRecord) -> Verdict:
     told = sorted((_reason(*one) for one in _faults(record)), key=lambda one: -MILDEST_FIRST.index(one.word))
     if told and told[0].word != USE:
         return Verdict(told[0].word, tuple(told))
-    used = [stack for stack in record.stacks if not (stack.quality and stack.quality.left_out)]
+    used = _used(record)
     facts = {"n": len(used), "all": len(record.stacks), "agreement": ", ".join(map(_agreement, used))}
     good = _reason("all agree", facts | {"good": RETRY_BELOW_CORRELATION})
     return Verdict(USE, (good, *told, _reason("all seen", {"what": NAME_OF[record.settings.anatomy]})))
@@ -93,6 +93,8 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
         yield "rollbacks", {"n": record.n_rollbacks}
     if len(record.stacks) == 1:
         yield "single stack", {}
+    elif len(_used(record)) == 2 and not any(stack.quality and is_mirrored(stack.quality) for stack in record.stacks):
+        yield "two stacks", {}
     found = record.registration
     if found and nearly_parallel(found.crossing_deg):
         yield "stacks parallel", {"angle": f"{found.crossing_deg:.0f}", "good": MIN_CROSSING_DEG}
@@ -128,6 +130,10 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
             yield "warning", {"line": line}
 
 
+def _used(record: RunRecord) -> list[StackRecord]:
+    return [stack for stack in record.stacks if not (stack.quality and stack.quality.left_out)]
+
+
 def _n_steps(record: RunRecord) -> int:
     return len(record.loss.get(Stage.FIT_TO_SLICES, []))
 
@@ -149,8 +155,7 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
         return
     facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
     if is_mirrored(quality):
-        name = "stack mirrored" if quality.reliable is False else "perhaps mirrored"
-        yield name, facts | {"handedness": rounded_down(quality.handedness), "good": MIRRORED_BELOW}
+        yield "stack mirrored", facts | {"handedness": rounded_down(quality.handedness), "good": MIRRORED_BELOW}
         if not shortfalls(quality):
             return
     if quality.reliable is False:

@@ -42,12 +42,6 @@ MESSAGES = {
         "Slices may be in reverse order, or a header may swap two sides, of this stack or of the others: what is shown "
         "as left may be right. Find out which one is wrong, leave it out, and run again.",
     ),
-    "perhaps mirrored": Message(
-        CHECK,
-        "{stack} may be a mirror image of what the other stack shows (handedness {handedness}; good is above {good:g})",
-        "Check the order of slices and the headers of both, and compare them where the head is not symmetric. In a "
-        "head that is nearly symmetric this may be said without cause; a third stack decides.",
-    ),
     "mirrored left out": Message(
         CHECK,
         "{stack} was left out: {why}",
@@ -159,6 +153,12 @@ MESSAGES = {
         CHECK, "this is a preview: {what}, without uncertainty", "Run again with another --preset before reading it."
     ),
     "warning": Message(CHECK, "{line}", ""),
+    "two stacks": Message(
+        USE,
+        "two stacks do not show whether one of them is a mirror image of the other",
+        "Slices in reverse order or a header that swaps two sides would do it. Compare both where the head is not "
+        "symmetric, or add a third stack.",
+    ),
     "left out": Message(
         USE,
         "{stack} was left out: {why}",

@@ -12,7 +12,7 @@ from data_synth.template import atlas_templates
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.atlas_frame import RIVAL_DEG, Orientation, standard_orientation
+from g3r.registration.atlas_frame import RIVAL_DEG, Orientation, into_atlas, standard_orientation
 from g3r.registration.atlas_search import nearest_templates
 from g3r.registration.thresholds import MIN_RIVAL_MARGIN
 from tests.registration.moving_heads import STILL, as_slices, rotation_angle_deg, simulated, turned_about
@@ -52,6 +52,21 @@ def test_several_stacks_are_held_by_their_headers(head: Phantom, own_template: A
     slices, _ = as_slices(simulated(head, STILL, n_stacks=2, seed=2))
     found = found_from_far(slices, own_template)
     assert found is None or (found.rival is None and turn_deg(found, slices) > RIVAL_DEG)
+
+
+@pytest.mark.parametrize("far_deg", [0.0, START_DEG])
+def test_stacks_that_hold_together_are_moved_into_the_atlas_from_everywhere(
+    head: Phantom, own_template: AtlasTemplate, far_deg: float
+) -> None:
+    slices, _ = as_slices(simulated(head, STILL, seed=2))
+    far = turned_about(slices.planes.center_mm.mean(0), np.deg2rad([far_deg, 0, 0]), np.array([10.0, -8.0, 5.0]))
+    held = RigidPose.concatenated([far] * len(slices))
+    found = into_atlas(slices, held, nearest_templates(slices, own_template)[0], np.random.default_rng(0))
+    assert rotation_angle_deg(found.rotation[0]) < 10
+    corners = slices.planes.corners_mm()
+    assert np.linalg.norm(found.apply(corners) - corners, axis=-1).max() < 8
+    relative = found @ found.take([0] * len(slices)).inverse()
+    np.testing.assert_allclose(relative.rotation, np.broadcast_to(np.eye(3), relative.rotation.shape), atol=1e-9)
 
 
 def test_a_template_that_looks_alike_the_other_way_round_makes_the_orientation_doubtful(

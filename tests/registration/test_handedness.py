@@ -37,7 +37,6 @@ def found(stacks: list[SimulatedStack], seed: int = 0, *, mm: float = 0.0) -> li
 @pytest.mark.parametrize("mm", [0.0, 0.4])
 def test_stacks_of_one_head_have_its_hand(still: list[SimulatedStack], mm: float) -> None:
     assert min(found(still, mm=mm)) > 0.05
-    assert min(found(still[:2], mm=mm)) > 0.05
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
@@ -51,10 +50,9 @@ def test_the_mirrored_one_of_three_is_found(
     assert min(one for n, one in enumerate(of_stacks) if n != which) > 0.05  # as without the mirrored stack
 
 
-def test_of_two_each_is_the_mirror_image_of_the_other(
-    still: list[SimulatedStack], mirrored: list[SimulatedStack]
-) -> None:
-    assert max(found([still[0], mirrored[1]])) < MIRRORED_BELOW
+def test_two_stacks_cannot_tell(still: list[SimulatedStack], mirrored: list[SimulatedStack]) -> None:
+    slices = as_slices([still[0], mirrored[1]])[0]
+    assert handedness(slices, np.ones(len(slices))) == [None, None]
 
 
 def test_a_head_that_is_mirrored_as_a_whole_agrees_with_itself(mirrored: list[SimulatedStack]) -> None:
@@ -82,7 +80,7 @@ def test_what_the_others_saw_on_one_side_alone_is_no_mirror_image(still: list[Si
     slices = as_slices(still)[0]
     across = np.abs(slices.planes.rotation[:, 0, 2]) > 0.9  # sagittal slices
     first = slices.stack_id == slices.stack_id[~across][0]
-    halved = slices.take(first | (across & (slices.planes.center_mm[:, 0] < 12)))
+    halved = slices.take(first | (slices.planes.center_mm[:, 0] < 12))
     of_first = handedness(halved, np.ones(len(halved)))[0]
     assert of_first is not None
     assert of_first > 0.05

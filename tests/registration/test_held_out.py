@@ -13,9 +13,9 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import held_out
 from g3r.registration.held_out import (
-    best_initialisation,
     fine_held_out_correlations,
     held_out_score,
+    held_out_scores,
     predict,
     volume_without,
 )
@@ -94,18 +94,16 @@ def test_poses_pay_a_penalty_for_their_movements(
     )
 
 
-def test_the_true_initialisation_is_chosen(moving: Moving) -> None:
+def test_the_true_initialisation_has_the_lowest_cost(moving: Moving) -> None:
     slices, truth = moving.slices, moving.truth
     initialisations = {
         "headers": RigidPose.identity(len(slices)),
         "truth": truth,
         "nearly": slices_disturbed(slices.with_motion(truth), 4.0, 3.0).world_from_header(),
     }
-    name, scores = best_initialisation(slices, StackSamples.of_all(slices), initialisations)
-    assert name == "truth"
+    scores = held_out_scores(slices, StackSamples.of_all(slices), initialisations)
     assert set(scores) == set(initialisations)
-    assert scores["truth"].cost < scores["nearly"].cost
-    assert scores["truth"].cost < scores["headers"].cost
+    assert scores["truth"].cost < min(scores["nearly"].cost, scores["headers"].cost)
 
 
 def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose]) -> None:

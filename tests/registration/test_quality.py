@@ -161,15 +161,6 @@ def test_a_mirror_image_of_two_others_is_not_reliable_and_called_by_its_name(
     assert all(line.startswith(f"{still[2].stack.name}: probably a mirror image") for line in lines)
 
 
-def test_of_two_stacks_one_may_be_a_mirror_image_and_both_are_reliable(still: list[SimulatedStack]) -> None:
-    estimate = estimate_with([0.8, 0.8], [0.95] * 2, [1.0] * 2, [0, 2])
-    estimate.handedness = [0.2, MIRRORED_BELOW - 0.01]
-    found = stack_qualities(estimate, 3)
-    assert [one.reliable for one in found] == [True, False, True]  # the second stack has no slices
-    (line,) = pose_warnings(found, [one.stack for one in still])[1:]
-    assert line.startswith(f"{still[2].stack.name}: may be a mirror image of what the other stack shows")
-
-
 @pytest.mark.parametrize(("ncc", "reliable"), [(0.85, [True, False, True]), (MIN_NCC - 0.01, [False, True, True])])
 def test_a_stack_is_one_too_many_where_no_other_failed(ncc: float, reliable: list[bool]) -> None:
     estimate = estimate_with([0.8] * 3, [ncc, 0.85, 0.85], [1.0] * 3, [0, 1, 2])

@@ -33,12 +33,7 @@ FILLED_IN = {
     "shortfalls": "what is bad of it, and what is good",
 }
 
-GOOD = {
-    "stack mirrored": MIRRORED_BELOW,
-    "perhaps mirrored": MIRRORED_BELOW,
-    "stack jumps": MAX_MEDIAN_MOVE_MM,
-    "stacks parallel": MIN_CROSSING_DEG,
-}
+GOOD = {"stack mirrored": MIRRORED_BELOW, "stack jumps": MAX_MEDIAN_MOVE_MM, "stacks parallel": MIN_CROSSING_DEG}
 """Limits of messages; the others use the limit of the agreement."""
 
 LINES = {

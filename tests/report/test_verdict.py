@@ -20,7 +20,6 @@ from g3r.registration.quality import (
     LEFT_OUT,
     NO_SLICE,
     PARALLEL,
-    PERHAPS_MIRRORED,
     PROBABLY_MIRRORED,
     WITHOUT_SLICES,
     pose_warnings,
@@ -42,8 +41,8 @@ def test_nothing_wrong_is_use_with_what_speaks_for_it() -> None:
     )
 
 
-def stacks_with(one: Any) -> RunRecord:
-    return record(stack("a.nii"), stack("b.nii"), one)
+def stacks_with(one: Any, **more: Any) -> RunRecord:
+    return record(stack("a.nii"), stack("b.nii"), one, **more)
 
 
 def oriented(best: float, rival: float) -> RunRecord:
@@ -93,11 +92,6 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         stacks_with(stack("c.nii", replace(quality(False), handedness=-0.13))),
         DO_NOT_USE,
         "c.nii seems to be a mirror image of what the other stacks show (handedness -0.13; good is above -0.02)",
-    ),
-    "perhaps mirrored": (
-        stacks_with(stack("c.nii", replace(quality(True), handedness=-0.13))),
-        CHECK,
-        "c.nii may be a mirror image of what the other stack shows (handedness -0.13; good is above -0.02)",
     ),
     "misfit left out": (
         stacks_with(stack("c.nii", replace(quality(False, 0.31), left_out=True))),
@@ -212,24 +206,24 @@ def test_the_way_on_from_an_interrupted_run_is_one_that_there_is() -> None:
 
 
 def test_the_worst_comes_first_and_the_line_has_only_that() -> None:
-    verdict = verdict_of(
-        record(stack("a.nii", thickness_from="spacing"), stack("b.nii", quality(False, 0.2)), unseen=unseen(0.05))
-    )
+    failed = stack("c.nii", quality(False, 0.2))
+    found = record(stack("a.nii", thickness_from="spacing"), stack("b.nii"), failed, unseen=unseen(0.05))
+    verdict = verdict_of(found)
     order = [MILDEST_FIRST.index(reason.word) for reason in verdict.reasons]
     assert order == sorted(order, reverse=True)
     assert len(verdict.reasons) == 3
-    assert verdict.line().startswith("do not use: b.nii")
+    assert verdict.line().startswith("do not use: c.nii")
     assert "thickness" not in verdict.line()
 
 
 def test_a_warning_with_words_of_its_own_is_not_said_twice() -> None:
     share = unseen(0.1)
     lines = [
-        "b.nii: registration probably failed (correlation ...); do not rely on the volume",
+        "c.nii: registration probably failed (correlation ...); do not rely on the volume",
         *rollback_warnings(1),
         str(share.line()),
     ]
-    found = record(stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
+    found = stacks_with(stack("c.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
     assert len(verdict_of(found).reasons) == 3
 
 
@@ -239,7 +233,6 @@ def test_warnings_about_a_quality_are_those_that_the_verdict_says_otherwise() ->
     judged = {
         LEFT_OUT: replace(mirrored, left_out=True),
         NO_SLICE: WITHOUT_SLICES,
-        PERHAPS_MIRRORED: replace(mirrored, reliable=True),
         PROBABLY_MIRRORED: mirrored,
         FAILED: quality(False, 0.31),
     }
@@ -263,11 +256,19 @@ def test_what_speaks_for_a_volume_is_said_of_the_stacks_in_it() -> None:
     verdict = verdict_of(found)
     n_stacks = len(found.stacks)
     assert f"{n_stacks - 1} of {n_stacks} stacks agree with each other" in verdict.line()
-    assert len(verdict.reasons) == 3
+    assert len(verdict.reasons) == 4  # two stacks are left
     mirrored = replace(
         CASES["mirrored left out"][0], warnings=["c.nii: left out of the volume, it is probably a mirror"]
     )
     assert len(verdict_of(mirrored).reasons) == 1
+
+
+@pytest.mark.parametrize("n_stacks", [1, 2, 3])
+def test_two_stacks_are_said_not_to_show_a_mirror_image(n_stacks: int) -> None:
+    verdict = verdict_of(record(*(stack(f"{n}.nii") for n in range(n_stacks))))
+    said = [reason for reason in verdict.reasons if "mirror image" in reason.text]
+    assert len(said) == (n_stacks == 2)
+    assert all(reason.word == USE for reason in said)
 
 
 def test_slivers_are_not_mentioned() -> None:
