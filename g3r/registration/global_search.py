@@ -54,24 +54,25 @@ class SearchResult:
 
 
 @dataclass(frozen=True)
-class _Starts:
-    """Initialisations: motions [K] and their held-out scores by name, the slices in the template, and that as fill."""
+class _Candidate:
+    """Motions [K] of all slices (world from header), their held-out score, and the initialisation they come from."""
 
-    motion: dict[str, RigidPose]
-    score: dict[str, HeldOutScore]
-    placed: AtlasPlacement | None
-    fill: ScaledTemplate | None
+    name: str
+    motion: RigidPose
+    score: HeldOutScore
 
-    def result(self, name: str, motion: RigidPose, score: HeldOutScore) -> SearchResult:
-        """A result of the search that started from one of these."""
-        return SearchResult(
-            motion=motion,
-            initialisation=name,
-            initialisations={key: value.correlations for key, value in self.score.items()},
-            placed=self.placed,
-            fill=self.fill,
-            score=score,
-        )
+    @property
+    def cost(self) -> float:
+        """Lower is better."""
+        return self.score.cost
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The slices in the atlas template, and the template where it stands for what is missing; None without either."""
+
+    placed: AtlasPlacement | None = None
+    fill: ScaledTemplate | None = None
 
 
 @dataclass(frozen=True)
@@ -101,29 +102,34 @@ class GlobalSearch:
             deadline: no attempt begins after it, and the first one ends by it if it can.
         """
         rng = np.random.default_rng([self.settings.seed, 0])
-        starts = self._starts(proposals, rng)
-        ranked = sorted(starts.motion, key=lambda name: starts.score[name].cost)
-        best = starts.result(ranked[0], starts.motion[ranked[0]], starts.score[ranked[0]])
-        found: list[RigidPose] = []
+        starts, frame = self._starts(proposals, rng)
+        ranked = sorted(starts, key=lambda one: one.cost)
+        sure = RETRY_BELOW_CORRELATION if frame.fill is None else RETRY_WITH_TEMPLATE_BELOW
+        best, found = ranked[0], list[RigidPose]()
         for attempt in range(max(1, self.settings.attempts) if self.settings.segments else 0):
             combines = attempt > 1 and attempt == self.settings.attempts - 1
-            name = best.initialisation if combines else ranked[attempt % len(ranked)]
-            start, score = (best.motion, _score(best)) if combines else (starts.motion[name], starts.score[name])
-            others = found if combines else [motion for key, motion in starts.motion.items() if key != name]
-            motion, score = self._segments(name, start, score, others, starts.fill, rng, deadline)
-            found.append(motion)
-            if score.cost < _score(best).cost:
-                best = starts.result(name, motion, score)
-            lowest = min(_score(best).correlations)
-            sure = RETRY_BELOW_CORRELATION if starts.fill is None else RETRY_WITH_TEMPLATE_BELOW
+            start = best if combines else ranked[attempt % len(ranked)]
+            others = found if combines else [one.motion for one in starts if one is not start]
+            now = self._in_segments(start, others, frame.fill, rng, deadline)
+            found.append(now.motion)
+            best = min(best, now, key=lambda one: one.cost)
+            lowest = min(best.score.correlations)
             if lowest >= sure or (deadline is not None and deadline.record_whether_passed()):
                 break
             rng = np.random.default_rng([self.settings.seed, attempt + 1])
             logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
-        return best
+        return SearchResult(
+            motion=best.motion,
+            initialisation=best.name,
+            initialisations={one.name: one.score.correlations for one in starts},
+            placed=frame.placed,
+            fill=frame.fill,
+            score=best.score,
+        )
 
-    def _starts(self, proposals: Mapping[str, RigidPose], rng: np.random.Generator) -> _Starts:
-        slices, samples, placed, fill = self.slices, self.samples, None, None
+    def _starts(self, proposals: Mapping[str, RigidPose], rng: np.random.Generator) -> tuple[list[_Candidate], _Frame]:
+        """The initialisations, and the frame that they are in."""
+        slices, samples, frame = self.slices, self.samples, _Frame()
         motions = {"headers": RigidPose.identity(len(slices))}
         if self.settings.network:
             motions |= dict(proposals)
@@ -131,13 +137,14 @@ class GlobalSearch:
             motions["stacks"] = register_stacks(slices).world_from_header()
         if self.template is not None:
             placed = place_in_atlas(slices, samples, self.template, rng)
-            in_atlas = placed.motion(len(slices), samples)
+            in_atlas, frame = placed.motion(len(slices), samples), _Frame(placed)
             if any(sample.profile.has_missing for sample in samples):
                 # the template stands for what is missing, so every initialisation has to be in its frame
-                fill = placed.template
+                frame, fill = _Frame(placed, placed.template), placed.template
                 motions = {name: self._in_frame(motion, in_atlas, fill, rng) for name, motion in motions.items()}
             motions["template"] = in_atlas
-        return _Starts(motions, held_out_scores(slices, samples, motions, fill), placed, fill)
+        scores = held_out_scores(slices, samples, motions, frame.fill)
+        return [_Candidate(name, motion, scores[name]) for name, motion in motions.items()], frame
 
     def _in_frame(
         self, motion: RigidPose, in_atlas: RigidPose, fill: ScaledTemplate, rng: np.random.Generator
@@ -147,32 +154,35 @@ class GlobalSearch:
         moved = into_atlas(self.slices, motion, fill, rng)
         return min(aligned, moved, key=lambda one: held_out_score(self.slices, self.samples, one, fill).cost)
 
-    def _segments(
+    def _in_segments(
         self,
-        name: str,
-        start: RigidPose,
-        score: HeldOutScore,
+        start: _Candidate,
         others: Sequence[RigidPose],
         fill: ScaledTemplate | None,
         rng: np.random.Generator,
         deadline: Deadline | None,
-    ) -> tuple[RigidPose, HeldOutScore]:
-        """Motion segments that predict the stacks better than the motions to start from, or these; and their score."""
+    ) -> _Candidate:
+        """Motion segments that predict the stacks better than the motions to start from, or these.
+
+        Args:
+            start: motions to start from.
+            others: further motions [K], candidates in the first round.
+            fill: see `volume_without`.
+            rng: source of randomness.
+            deadline: see `refine_segments`.
+        """
         slices, samples = self.slices, self.samples
-        aligned = [aligned_to(slices, start, other) for other in others]
-        segmented, placements = refine_segments(slices, samples, start, aligned, rng, deadline, fill, score)
+        aligned = [aligned_to(slices, start.motion, other) for other in others]
+        segmented, placements = refine_segments(
+            slices, samples, start.motion, aligned, rng, deadline, fill, start.score
+        )
         interleave = [placement.segments.interleave for placement in placements]
         segmented = collapse_to_rigid(slices, samples, segmented, interleave, fill)
-        after = held_out_score(slices, samples, segmented, fill)
+        after = _Candidate(start.name, segmented, held_out_score(slices, samples, segmented, fill))
         # with parts missing, segments gain less; a start from the template alone was not fitted to the other
         # stacks, so any gain counts
-        needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN
-        return (segmented, after) if after.cost <= score.cost - needed else (start, score)
-
-
-def _score(found: SearchResult) -> HeldOutScore:
-    assert found.score is not None
-    return found.score
+        needed = 0.0 if fill is not None and start.name == "template" else MIN_COST_GAIN
+        return after if after.cost <= start.cost - needed else start
 
 
 def search_single(

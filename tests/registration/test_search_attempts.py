@@ -13,7 +13,7 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings
-from g3r.registration.global_search import GlobalSearch
+from g3r.registration.global_search import GlobalSearch, _Candidate
 from g3r.registration.similarity import StackSamples
 from g3r.registration.thresholds import RETRY_BELOW_CORRELATION, RETRY_WITH_TEMPLATE_BELOW
 from g3r.run.deadline import Deadline
@@ -28,11 +28,11 @@ class Told(GlobalSearch):
     finds: Sequence[tuple[float, float]]
     begun: list[tuple[str, int]]
 
-    def _segments(self, name: str, start: RigidPose, score: Any, others: Sequence[RigidPose], *_: Any) -> Any:
-        n = len(self.begun)
-        self.begun.append((name, len(others)))
-        cost, lowest = self.finds[n]
-        return RigidPose.identity(len(self.slices)), SimpleNamespace(cost=cost, correlations=[lowest, 0.9])
+    def _in_segments(self, start: _Candidate, others: Sequence[RigidPose], *_: Any) -> _Candidate:
+        cost, lowest = self.finds[len(self.begun)]
+        self.begun.append((start.name, len(others)))
+        score: Any = SimpleNamespace(cost=cost, correlations=[lowest, 0.9])
+        return _Candidate(start.name, RigidPose.identity(len(self.slices)), score)
 
 
 def told(
