@@ -14,6 +14,7 @@ from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import into_atlas
 from g3r.registration.atlas_search import AtlasPlacement, ScaledTemplate, place_in_atlas
 from g3r.registration.held_out import HeldOutScore, held_out_score, held_out_scores
+from g3r.registration.motion_segments import STEADY_MM, head_distance_mm
 from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments, rigid_or_segments
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
@@ -30,6 +31,9 @@ from g3r.registration.unseen import with_header_spans
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
+
+AGREEING_SHARE = 0.9
+"""Share of the slices that two attempts from different starts must put in the same places for a search to end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +96,7 @@ class GlobalSearch:
     template: AtlasTemplate | None
 
     def run(self, proposals: Mapping[str, RigidPose], deadline: Deadline | None = None) -> SearchResult:
-        """Search until every stack is well predicted by the others, or the attempts are used up.
+        """Search until every stack is well predicted by the others, two attempts agree, or the attempts are used up.
 
         Each attempt begins at the next best initialisation, and the last one at the best motions so far, with all
         others as candidates: segments that one attempt has missed another may have found.
@@ -111,10 +115,11 @@ class GlobalSearch:
             start = best if combines else ranked[attempt % len(ranked)]
             others = found if combines else [one.motion for one in starts if one is not start]
             now = self._in_segments(start, others, frame.fill, rng, deadline)
+            agrees = bool(found) and self._agree(best.motion, now.motion)
             found.append(now.motion)
             best = min(best, now, key=lambda one: one.cost)
             lowest = min(best.score.correlations)
-            if lowest >= sure or (deadline is not None and deadline.record_whether_passed()):
+            if lowest >= sure or agrees or (deadline is not None and deadline.record_whether_passed()):
                 break
             rng = np.random.default_rng([self.settings.seed, attempt + 1])
             logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
@@ -126,6 +131,12 @@ class GlobalSearch:
             fill=frame.fill,
             score=best.score,
         )
+
+    def _agree(self, one: RigidPose, other: RigidPose) -> bool:
+        """Whether two sets of motions [K] put nearly all slices in the same places to each other."""
+        center_mm = np.mean([sample.pixels.center_mm for sample in self.samples], axis=0)
+        apart_mm = head_distance_mm(one, aligned_to(self.slices, one, other), center_mm)
+        return bool((np.diagonal(apart_mm) < STEADY_MM).mean() >= AGREEING_SHARE)
 
     def _starts(self, proposals: Mapping[str, RigidPose], rng: np.random.Generator) -> tuple[list[_Candidate], _Frame]:
         """The initialisations, and the frame that they are in."""

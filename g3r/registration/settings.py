@@ -16,7 +16,8 @@ class RegistrationSettings:
         stacks: initialisation by stacks registered to each other from many starts.
         segments: place motion segments again in the volume of the other stacks.
         n_candidates: random motions tried at once for a stack in the search.
-        attempts: at most this many searches for motion segments, while stacks do not predict each other well.
+        attempts: at most this many searches for motion segments, while stacks do not predict each other well and no two
+            attempts agree.
         n_rounds: alternations of volume and slices; 0 leaves the slices at their motion segments.
         stray_searches: after the rounds, at most this many searches for slices that went astray; more rounds follow
             each search that found some.
