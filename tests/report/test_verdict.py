@@ -282,9 +282,14 @@ def test_the_table_says_things_in_the_same_form() -> None:
         assert message.advice == "" or message.advice.endswith("."), name
 
 
-def test_nobody_asks_for_the_sides_of_one_stack_or_of_a_preview() -> None:
-    texts = [reason.text for reason in verdict_of(hurried(n_stacks=1)).reasons]
-    assert not any("mirror image" in text for text in texts)
+@pytest.mark.parametrize("n_stacks", [1, 2])
+def test_nobody_asks_for_the_sides_of_one_or_two_stacks(n_stacks: int) -> None:
+    """More time would not tell either."""
+    texts = [reason.text for reason in verdict_of(hurried(n_stacks=n_stacks)).reasons]
+    assert not any("there was no time" in text for text in texts)
+
+
+def test_nobody_asks_for_the_sides_of_a_preview() -> None:
     preview = replace(hurried(n_stacks=3), settings=PRESETS["preview"])
     assert [reason.text.split(":")[0] for reason in verdict_of(preview).reasons] == ["this is a preview"]
 
