@@ -37,8 +37,10 @@ logger = logging.getLogger(__name__)
 MAX_PIXELS = 200_000
 """Largest number of pixels, about, in a Gauss-Newton step."""
 
-MAX_LOSS = 0.002
-"""A round whose mean held-out correlation is lower than before by more than this is undone."""
+MAX_LOSS = 0.02
+"""A round whose mean held-out correlation is lower than before by more than this is undone. It guards against a round
+that goes astray; finer it does not tell: of 32 pairs of simulated stacks with moving heads that were in place, nearly
+all came nearer to the truth in every round, while this correlation changed by -0.014 to +0.11 (by hand)."""
 
 
 @dataclass(frozen=True, kw_only=True)
