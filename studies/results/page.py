@@ -27,6 +27,7 @@ TOPICS: Mapping[str, Callable[[], Iterable[Claim]]] = {
     "One stack": paper_claims.one_stack,
     "Parts of the fit": paper_claims.parts,
     "The prior": further_claims.prior,
+    "Lesions": picture_claims.lesions,
     "Real stacks": paper_claims.real,
     "The verdict": further_claims.verdicts,
     "Speed against accuracy": further_claims.presets,

@@ -1,4 +1,4 @@
-"""Claims about masks, about the unseen part of the head, and in comparison with another program."""
+"""Claims about lesions, masks, the unseen part of the head, and in comparison with another program."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from statistics import mean
 
+from studies.lesions.kept import WANTED_SHARE, WITH_PRIOR, WITHOUT_PRIOR
 from studies.results.blocks import Block, TableRow, number
 from studies.results.findings import FEW, Claim, Finding, column, paired, shares, table_after, value
 
@@ -199,6 +200,37 @@ def masks() -> Iterator[Claim]:
     yield volumes_of_real_masks()
     yield cost_of_masks("true")
     yield cost_of_masks("drawn")
+
+
+def lesions() -> Iterator[Claim]:
+    """Claims about lesions that slices cover."""
+
+    def kept(n_stacks: int) -> Claim:
+        words = f"{n_stacks} stack{'s' * (n_stacks != 1)}"
+
+        def find(block: Block) -> Finding | None:
+            every = table_after(block, "Every lesion")
+            rows = [row for row in (every.rows if every else ()) if row["stacks"] == str(n_stacks)]
+            kept = [column(rows, name) for name in (WITH_PRIOR, WITHOUT_PRIOR)]
+            ratios = [one / other for one, other in zip(*kept, strict=True)]
+            if not ratios:
+                return None
+            heads = len({row["subject"] for row in rows})
+            figure = f"{100 * mean(ratios):.0f} %, least {100 * min(ratios):.0f} %, of {len(ratios)} lesions"
+            return Finding(figure=figure, n=heads, of="heads", holds=min(ratios) >= WANTED_SHARE, enough=heads >= FEW)
+
+        text = f"From {words} a lesion keeps its contrast with the prior"
+        return Claim(
+            text=text,
+            asked=f"{100 * WANTED_SHARE:.0f} % or more, of each, of what the fit without prior keeps, asked for",
+            block="lesions",
+            find=find,
+            yes=f"{text} ({{figure}} of what is kept without it).",
+            no=f"{text} not as well as was asked for ({{figure}} of what is kept without it).",
+        )
+
+    yield kept(3)
+    yield kept(1)
 
 
 def unseen() -> Iterator[Claim]:

@@ -14,7 +14,7 @@ from studies.results.blocks import NO_MEASUREMENT, PAGE, Block, origin, publishe
 from studies.results.findings import FAILS, HOLDS, MISSING, UNSAID, Claim, Finding, Judged, judged, paired, shares
 from studies.results.page import MARKER, TOPICS, judgements, main, page
 from studies.results.paper_claims import mild_motion, one_stack, parts, table_1
-from studies.results.picture_claims import real_masks, volumes_of_real_masks
+from studies.results.picture_claims import lesions, real_masks, volumes_of_real_masks
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +133,22 @@ def test_real_masks() -> None:
         worse = outcome([real_masks()], "real stacks", replace(block, text=f"{block.text}\n{more}"))
         assert worse.finding is not None
         assert not worse.finding.holds
+
+
+def test_lesions_are_judged_by_the_one_that_keeps_least() -> None:
+    head = "Every lesion\n\n| subject | stacks | lesion | without prior | with prior | prior alone |\n"
+    head += "| --- | ---: | ---: | ---: | ---: | ---: |\n"
+    rows = [f"| head-{n} | 3 | bright | 1.00 | 0.9{n} | 0.80 |" for n in range(4)]
+    block = Block("lesions", "prior.md", "", head + "\n".join(rows))
+    three = outcome(list(lesions()), "3 stacks", block)
+    assert three.outcome == HOLDS
+    assert three.finding is not None
+    assert three.finding.figure == "92 %, least 90 %, of 4 lesions"
+    assert outcome(list(lesions()), "1 stack", block).outcome == MISSING
+    one_lost = replace(block, text=f"{block.text}\n| head-0 | 3 | dark | 1.00 | 0.84 | 0.80 |")
+    assert outcome(list(lesions()), "3 stacks", one_lost).outcome == FAILS
+    of_few_heads = replace(block, text=head + "\n".join(rows[:3]))
+    assert outcome(list(lesions()), "3 stacks", of_few_heads).outcome == UNSAID
 
 
 def test_one_stack_and_the_parts() -> None:
