@@ -11,7 +11,7 @@ import numpy as np
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.mask_agreement import RefinedMasks
-from g3r.fitting.pose_rounds import MAX_LOSS, RefinedPoses
+from g3r.fitting.pose_rounds import RefinedPoses
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.mixture import FinishedVolume
@@ -82,7 +82,7 @@ def _(found: RefinedPoses) -> Iterator[Told]:
         return
     before, after = record.held_out[0], record.held_out[record.n_kept]
     facts = {"before": f"{before:.2f}", "after": f"{after:.2f}"}
-    if not record.n_kept or after < before - MAX_LOSS:
+    if not record.n_kept:
         yield "rounds undone", {}
     else:
         yield "rounds helped" if after > before + BETTER else "rounds helped little", facts

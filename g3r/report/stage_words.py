@@ -55,7 +55,7 @@ LINES = {
     "moved to prior": ("slices to prior", "the slices move to fit other brains"),
     "not moved to prior": ("slices to prior", "the slices stay where they were"),
     "rounds helped": ("poses in rounds", "done again, stacks agree better ({before} to {after})"),
-    "rounds helped little": ("poses in rounds", "done again, stacks agree as before ({after})"),
+    "rounds helped little": ("poses in rounds", "done again, stacks agree about as before ({before}, then {after})"),
     "rounds undone": ("poses in rounds", "done again, which did not help and was undone"),
     "rounds alone": ("poses in rounds", "done again with the volume so far"),
     "gaussians": ("fit to prior", "made of {n:Gaussian}"),

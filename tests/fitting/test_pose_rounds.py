@@ -126,15 +126,27 @@ def test_slices_of_several_stacks_are_searched_for_where_they_do_not_fit(
     assert all(one[middle] < 0.5 * np.median(one) for one in weights)
 
 
-def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    falling = iter([0.9, 0.9 - 2 * pose_rounds.MAX_LOSS, 0.95])
-    monkeypatch.setattr(pose_rounds, "fine_held_out_correlations", lambda slices, gain: [next(falling)])
+def held_outs(monkeypatch: pytest.MonkeyPatch, *values: float) -> None:
+    """Let the held-out correlation have these values, before the first round and after each."""
+    given = iter(values)
+    monkeypatch.setattr(pose_rounds, "fine_held_out_correlations", lambda slices, gain: [next(given)])
+
+
+def test_a_round_that_goes_astray_is_undone_and_ends_the_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    held_outs(monkeypatch, 0.9, 0.9 - 2 * pose_rounds.MAX_LOSS, 0.95)
     start = registration_of(moved_away(make_slices()))
     found, maker = run(start, 3)
     assert found.record.n_kept == 0
     assert len(found.record.held_out) == 2
     assert found.registration is start
     assert maker.last == [True]  # the first V_prior was made with the quick option
+
+
+def test_rounds_do_not_lose_more_than_the_limit_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    held_outs(monkeypatch, *(0.9 - 0.7 * pose_rounds.MAX_LOSS * n for n in range(4)))
+    found, _ = run(registration_of(moved_away(make_slices())), 3)
+    assert found.record.n_kept == 1
+    assert len(found.record.held_out) == 3
 
 
 def test_each_round_leaves_no_more_of_an_open_shear_than_motion_is_likely_to_have(
