@@ -2,7 +2,8 @@
 
 Registration uses a least-squares volume that repeats the errors of its poses. The Gaussians start at V_prior, whose
 network has learned what heads look like, and slices move with them: two stacks, which check each other only where they
-cross, come nearer to the truth with every round. A round is kept if stacks predict each other no worse (`MAX_LOSS`).
+cross, come nearer to the truth with every round. A round is kept unless stacks then predict each other clearly worse
+(`MAX_LOSS`).
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ def refine_in_rounds(
     rng: np.random.Generator,
     progress: Progress = no_progress,
 ) -> RefinedPoses:
-    """Poses and prior volume after up to `n_rounds` rounds; the first round that does not help is the last.
+    """Poses and prior volume after up to `n_rounds` rounds; the first round that goes astray is the last.
 
     Args:
         registration: poses from the slices alone.

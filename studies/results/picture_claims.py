@@ -211,8 +211,8 @@ def lesions() -> Iterator[Claim]:
         def find(block: Block) -> Finding | None:
             every = table_after(block, "Every lesion")
             rows = [row for row in (every.rows if every else ()) if row["stacks"] == str(n_stacks)]
-            kept = [column(rows, name) for name in (WITH_PRIOR, WITHOUT_PRIOR)]
-            ratios = [one / other for one, other in zip(*kept, strict=True)]
+            shares_kept = (column(rows, name) for name in (WITH_PRIOR, WITHOUT_PRIOR))
+            ratios = [one / other for one, other in zip(*shares_kept, strict=True)]
             if not ratios:
                 return None
             heads = len({row["subject"] for row in rows})
